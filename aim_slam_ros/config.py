@@ -1,0 +1,202 @@
+"""Every setting, its default, its range and its meaning: the only place they are written.
+
+Sections are frozen dataclasses and are handed, one by one, to the code that needs them. A wrong
+name or value raises ConfigError with the allowed range, before any work starts.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from dataclasses import dataclass, field
+from typing import Any, Mapping, TypeVar
+
+import yaml
+
+T = TypeVar('T')
+
+
+class ConfigError(ValueError):
+    """A setting that does not exist or a value outside its range."""
+
+
+def _setting(default: T, doc: str, low: float | None = None, high: float | None = None,
+             choices: tuple[str, ...] | None = None) -> T:
+    """A dataclass field with its documentation and its allowed values."""
+    return field(default=default,
+                 metadata={'doc': doc, 'low': low, 'high': high, 'choices': choices})
+
+
+def allowed(spec: dataclasses.Field[Any]) -> str:
+    """The allowed values of a field, for a person."""
+    low, high = spec.metadata['low'], spec.metadata['high']
+    if spec.metadata['choices']:
+        return 'one of ' + ', '.join(spec.metadata['choices'])
+    if isinstance(spec.default, bool):
+        return 'true or false'
+    kind = {int: 'a whole number', float: 'a number'}.get(type(spec.default), 'text')
+    if low is not None and high is not None:
+        return f'{kind} from {low:g} to {high:g}'
+    if low is not None:
+        return f'{kind} of at least {low:g}'
+    return kind
+
+
+def _checked(name: str, spec: dataclasses.Field[Any], value: Any) -> Any:
+    """The value in the field's own type, or ConfigError."""
+    refusal = ConfigError(f'{name}: {value!r} is not allowed; expected {allowed(spec)}')
+    kind = type(spec.default)
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if type(value) is not kind:
+        raise refusal
+    low, high = spec.metadata['low'], spec.metadata['high']
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        # written so that nan, which compares false with everything, is refused too
+        if not ((low is None or value >= low) and (high is None or value <= high)
+                and abs(value) < float('inf')):
+            raise refusal
+    if spec.metadata['choices'] and value not in spec.metadata['choices']:
+        raise refusal
+    return value
+
+
+class _Section:
+    """Validates every field when it is made."""
+
+    def __post_init__(self) -> None:
+        for spec in dataclasses.fields(self):  # type: ignore[arg-type]
+            name = f'{type(self).__name__.removesuffix("Config").lower()}.{spec.name}'
+            object.__setattr__(self, spec.name, _checked(name, spec, getattr(self, spec.name)))
+
+
+@dataclass(frozen=True)
+class CameraConfig(_Section):
+    width: int = _setting(518, 'width of the image the model sees [px], a multiple of 14', 84, 1036)
+    use_calibration: bool = _setting(
+        False, "take the dataset's or camera_info's intrinsics instead of estimating them")
+    fov_deg: float = _setting(
+        60.0, 'horizontal field of view assumed where nothing better is known [deg]', 20, 140)
+    min_side: int = _setting(
+        32, 'a smaller image than this is skipped [px]', 8, 1000)
+    min_contrast: float = _setting(
+        2.0, 'an image whose grey values have a smaller standard deviation is skipped', 0, 100)
+
+
+@dataclass(frozen=True)
+class ModelConfig(_Section):
+    name: str = _setting('classical', 'the geometry model', choices=('classical',))
+    infer: str = _setting(
+        'on_demand', 'when the model is asked: where it pays, or for every image as in the paper',
+        choices=('on_demand', 'every_image'))
+
+
+@dataclass(frozen=True)
+class ClassicalConfig(_Section):
+    features: int = _setting(800, 'SIFT features per frame, at half resolution', 50, 10000)
+    ratio: float = _setting(0.9, 'ratio test between best and second-best match', 0.1, 1)
+    min_matches: int = _setting(24, 'fewer matches than this leave a view unconnected', 8, 1000)
+    rotation_gate_px: float = _setting(
+        10.0, 'median residual of a pure rotation below which there is no parallax '
+        '[px at a width of 518]', 0, 100)
+    planes: int = _setting(48, 'inverse-depth planes of the sweep', 8, 256)
+
+
+@dataclass(frozen=True)
+class SigmaConfig(_Section):
+    """Choice of the window's keyframes (SIGMA)."""
+
+    voxel_fraction: float = _setting(
+        0.06, "voxel size as a fraction of the first keyframe's median depth", 0.005, 1)
+    voxel_quantile: float = _setting(
+        0.1, 'this share of a keyframe, its least confident points, is not indexed', 0, 0.95)
+    stride: int = _setting(
+        4, 'every so many pixels of a keyframe are indexed and ranked', 1, 64)
+    candidates: int = _setting(10, 'keyframes kept by voxel overlap for the ranking', 1, 100)
+    points: int = _setting(
+        2000, 'least confident points of the last keyframe that the gain is computed on', 10, 100000)
+    sigma_px: float = _setting(1.0, 'noise of a pixel [px]', 0.01, 100)
+    sigma_depth: float = _setting(
+        0.05, 'relative noise of the depth at the median confidence', 1e-4, 1)
+    sigma_ray: float = _setting(
+        1e-3, 'isotropic noise added to a measured ray [rad]', 1e-6, 0.1)
+    depth_tolerance: float = _setting(
+        0.15, 'relative depth difference above which a candidate does not see a point', 0.001, 1)
+    kappa: float = _setting(
+        1.0, 'reduced chi-square above which another keyframe joins the window', 0)
+    max_window: int = _setting(5, 'views of a window, the current frame included', 2, 20)
+
+
+@dataclass(frozen=True)
+class JointTrackingConfig(_Section):
+    """The paper's joint solve (``tracker: paper``)."""
+
+    residual: str = _setting(
+        'hybrid', 'what is compared besides log-distances', choices=('ray', 'pixel', 'hybrid'))
+    pairs: str = _setting(
+        'composed', 'neighbouring views only, or also those with one view between them',
+        choices=('adjacent', 'composed'))
+    stride: int = _setting(4, 'every so many pixels of a view are matched', 1, 64)
+    sigma_ray: float = _setting(0.003, 'noise of a ray [rad]', 1e-6, 1)
+    sigma_pixel: float = _setting(1.0, 'noise of a projection [px]', 0.01, 100)
+    sigma_log_distance: float = _setting(0.05, 'noise of a log-distance', 1e-4, 10)
+    huber: float = _setting(1.345, 'whitened residual where Huber turns linear', 0.1, 100)
+    max_iterations: int = _setting(15, 'Levenberg-Marquardt steps per stage', 1, 200)
+    depth_tolerance: float = _setting(
+        0.15, 'relative distance difference above which a match is an occlusion', 0.001, 1)
+    confidence_quantile: float = _setting(
+        0.1, 'this share of a view, its least confident points, is not matched', 0, 0.95)
+    min_match_fraction: float = _setting(
+        0.05, 'a pair of views that shares less is not used', 0, 1)
+    memory: float = _setting(
+        1.0, 'weight of the earlier observations of a keyframe pair: 0 overwrites its relative '
+        'pose, 1 moves it by 1/(n+1) after n of them', 0, 100)
+
+
+@dataclass(frozen=True)
+class Config:
+    """All sections. ``seed`` fixes every random choice."""
+
+    seed: int = _setting(0, 'seed of every random choice', 0, 2**31 - 1)
+    camera: CameraConfig = CameraConfig()
+    model: ModelConfig = ModelConfig()
+    classical: ClassicalConfig = ClassicalConfig()
+    sigma: SigmaConfig = SigmaConfig()
+    joint_tracking: JointTrackingConfig = JointTrackingConfig()
+
+    def with_values(self, values: Mapping[str, str]) -> Config:
+        """A copy with settings replaced, ``{'section.name': 'text'}``; raises ConfigError."""
+        config = self
+        for name, text in values.items():
+            config = config._with(name, yaml.safe_load(text))
+        return config
+
+    def _with(self, name: str, value: Any) -> Config:
+        section_name, _, field_name = name.rpartition('.')
+        section = getattr(self, section_name, None) if section_name else self
+        specs = {f.name: f for f in dataclasses.fields(section)} if section is not None and \
+            dataclasses.is_dataclass(section) else {}
+        spec = specs.get(field_name)
+        if spec is None or not spec.metadata:
+            raise ConfigError(f'{name}: there is no such setting{self._nearest(name)}')
+        new = dataclasses.replace(section, **{field_name: _checked(name, spec, value)})
+        return dataclasses.replace(self, **{section_name: new}) if section_name else new
+
+    def settings(self) -> dict[str, dataclasses.Field[Any]]:
+        """Every setting by its full name."""
+        out: dict[str, dataclasses.Field[Any]] = {}
+        for spec in dataclasses.fields(self):
+            value = getattr(self, spec.name)
+            if dataclasses.is_dataclass(value):
+                out |= {f'{spec.name}.{f.name}': f for f in dataclasses.fields(value)}
+            else:
+                out[spec.name] = spec
+        return out
+
+    def _nearest(self, name: str) -> str:
+        near = difflib.get_close_matches(name, list(self.settings()), n=3, cutoff=0.4)
+        return f'; did you mean {" or ".join(near)}?' if near else ''
+
+    def to_yaml(self) -> str:
+        """The resolved configuration, written beside every result."""
+        return yaml.safe_dump(dataclasses.asdict(self), sort_keys=False)

@@ -1,0 +1,1 @@
+"""A weights-free geometry model: features, small bundle adjustment, plane sweep."""
