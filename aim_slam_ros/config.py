@@ -36,9 +36,9 @@ def allowed(spec: dataclasses.Field[Any]) -> str:
         return 'true or false'
     kind = {int: 'a whole number', float: 'a number'}.get(type(spec.default), 'text')
     if low is not None and high is not None:
-        return f'{kind} from {low:g} to {high:g}'
+        return f'{kind} from {low} to {high}'
     if low is not None:
-        return f'{kind} of at least {low:g}'
+        return f'{kind} of at least {low}'
     return kind
 
 
@@ -59,6 +59,18 @@ def _checked(name: str, spec: dataclasses.Field[Any], value: Any) -> Any:
     if spec.metadata['choices'] and value not in spec.metadata['choices']:
         raise refusal
     return value
+
+
+def _parsed(name: str, text: str) -> Any:
+    """The value that a person typed, or ConfigError."""
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f'{name}: {text!r} cannot be read as a value') from error
+    try:    # YAML takes 1e-3 for text: it wants 1.0e-3
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
 
 
 class _Section:
@@ -97,7 +109,7 @@ class ClassicalConfig(_Section):
     ratio: float = _setting(0.9, 'ratio test between best and second-best match', 0.1, 1)
     min_matches: int = _setting(24, 'fewer matches than this leave a view unconnected', 8, 1000)
     rotation_gate_px: float = _setting(
-        10.0, 'median residual of a pure rotation below which there is no parallax '
+        6.0, 'median residual of a pure rotation below which there is no parallax '
         '[px at a width of 518]', 0, 100)
     planes: int = _setting(48, 'inverse-depth planes of the sweep', 8, 256)
 
@@ -142,6 +154,8 @@ class JointTrackingConfig(_Section):
     sigma_log_distance: float = _setting(0.05, 'noise of a log-distance', 1e-4, 10)
     huber: float = _setting(1.345, 'whitened residual where Huber turns linear', 0.1, 100)
     max_iterations: int = _setting(15, 'Levenberg-Marquardt steps per stage', 1, 200)
+    relative_decrease: float = _setting(
+        1e-3, 'a step that lowers the cost by a smaller share ends a stage', 1e-12, 0.1)
     depth_tolerance: float = _setting(
         0.15, 'relative distance difference above which a match is an occlusion', 0.001, 1)
     confidence_quantile: float = _setting(
@@ -154,6 +168,95 @@ class JointTrackingConfig(_Section):
 
 
 @dataclass(frozen=True)
+class LoopClosureConfig(_Section):
+    """Retrieval, verification, pose graph and the fused map."""
+
+    enabled: bool = _setting(True, 'look for loops; otherwise only collect and fuse keyframes')
+    candidates: int = _setting(2, 'most similar keyframes that are verified', 1, 10)
+    min_gap: int = _setting(8, 'keyframes nearer in time than this many are no candidates', 1, 1000)
+    covisible_hops: int = _setting(
+        2, 'keyframes within this many edges are no candidates', 0, 10)
+    similarity: float = _setting(
+        0.8, "a candidate's similarity relative to the previous keyframe's", 0, 1)
+    min_matched: float = _setting(
+        0.15, "fraction of a keyframe's confident points that must be found in the other, in both "
+        'directions', 0, 1)
+    max_kappa: float = _setting(4.0, 'largest reduced chi-square of a verified loop', 0.1, 1000)
+    max_disagreement: float = _setting(
+        0.08, 'largest difference between the two directions of a loop, relative to the median '
+        'depth for translations and natural (rad, log-scale) for the rest', 0.001, 1)
+    max_depth_spread: float = _setting(
+        0.25, 'largest robust deviation of the log depth ratios between matched points', 0.01, 2)
+    cauchy_width: float = _setting(
+        3.0, 'whitened residual at which a loop edge has lost half its weight', 0.1, 100)
+    map_voxel: float = _setting(
+        0.01, "voxel of the fused map, as a fraction of the keyframes' median depth", 0.001, 0.2)
+    map_percentile: float = _setting(
+        40.0, 'the least confident part of each keyframe that the map leaves out [%]', 0, 99)
+
+
+@dataclass(frozen=True)
+class FollowingConfig(_Section):
+    points: int = _setting(400, 'corners of a keyframe that are followed', 50, 5000)
+    spacing_px: int = _setting(9, 'smallest distance between two of them [px]', 2, 50)
+    references: int = _setting(3, 'keyframes an image is followed against', 1, 10)
+    sigma_px: float = _setting(0.6, 'standard deviation of a followed point [px]', 0.05, 10)
+    sigma_depth: float = _setting(
+        0.03, "relative standard deviation of a keyframe's depth at its mean confidence",
+        0.001, 0.5)
+    min_inliers: int = _setting(30, 'fewer explained points than this are no pose', 6, 1000)
+    min_inlier_ratio: float = _setting(
+        0.4, 'smallest share of the found points that the pose must explain', 0.05, 1)
+
+
+@dataclass(frozen=True)
+class TrackingConfig(_Section):
+    tracker: str = _setting(
+        'image', "refine matches in the images, or the paper's joint Sim(3) solve",
+        choices=('image', 'paper'))
+    stride: int = _setting(6, 'every so many pixels of a keyframe are matched [px]', 1, 64)
+    sigma_px: float = _setting(
+        1.0, 'standard deviation of a refined match [px]; calibrates kappa', 0.05, 10)
+    min_matches: int = _setting(60, 'fewer refined matches than this: keep the pose mean',
+                                10, 100000)
+    max_stray: float = _setting(
+        0.15, 'how far the solve may move the camera from its start, relative to the median '
+        'depth, before the start is kept instead', 0.01, 10)
+
+
+@dataclass(frozen=True)
+class KeyframesConfig(_Section):
+    promote_below: float = _setting(
+        0.5, 'an image that still sees a smaller share of its reference keyframe is promoted',
+        0.05, 0.95)
+    reuse_above: float = _setting(
+        0.6, 'an older keyframe of which the image sees at least this share is taken as reference '
+        'instead of making a new one; 1 never reuses', 0.1, 1)
+    min_confident: float = _setting(
+        0.15, 'smallest share of pixels with a measured depth for a prediction to be used', 0, 1)
+    max_fuse_spread: float = _setting(
+        0.15, 'a prediction whose log depth ratios to the keyframe scatter more is not fused',
+        0.01, 2)
+
+
+@dataclass(frozen=True)
+class InitialisationConfig(_Section):
+    min_parallax_px: float = _setting(
+        8.0, 'parallax awaited by a model that needs two views [px at a width of 518]', 0.5, 200)
+    max_frames: int = _setting(
+        60, 'after so many images the map is begun without parallax', 2, 10000)
+
+
+@dataclass(frozen=True)
+class RelocalisationConfig(_Section):
+    candidates: int = _setting(3, 'keyframes retrieved for a lost image', 1, 20)
+    min_matched_fraction: float = _setting(
+        0.3, 'smallest matched fraction that ends a loss', 0.05, 1)
+    give_up_after: int = _setting(
+        45, 'after so many lost images a new map piece is begun', 1, 100000)
+
+
+@dataclass(frozen=True)
 class Config:
     """All sections. ``seed`` fixes every random choice."""
 
@@ -161,26 +264,33 @@ class Config:
     camera: CameraConfig = CameraConfig()
     model: ModelConfig = ModelConfig()
     classical: ClassicalConfig = ClassicalConfig()
+    following: FollowingConfig = FollowingConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    keyframes: KeyframesConfig = KeyframesConfig()
+    initialisation: InitialisationConfig = InitialisationConfig()
+    relocalisation: RelocalisationConfig = RelocalisationConfig()
     sigma: SigmaConfig = SigmaConfig()
     joint_tracking: JointTrackingConfig = JointTrackingConfig()
+    loop_closure: LoopClosureConfig = LoopClosureConfig()
 
     def with_values(self, values: Mapping[str, str]) -> Config:
         """A copy with settings replaced, ``{'section.name': 'text'}``; raises ConfigError."""
         config = self
         for name, text in values.items():
-            config = config._with(name, yaml.safe_load(text))
+            config = config._with(name, _parsed(name, text))
         return config
 
     def _with(self, name: str, value: Any) -> Config:
         section_name, _, field_name = name.rpartition('.')
-        section = getattr(self, section_name, None) if section_name else self
+        section: Any = getattr(self, section_name, None) if section_name else self
         specs = {f.name: f for f in dataclasses.fields(section)} if section is not None and \
             dataclasses.is_dataclass(section) else {}
         spec = specs.get(field_name)
         if spec is None or not spec.metadata:
             raise ConfigError(f'{name}: there is no such setting{self._nearest(name)}')
         new = dataclasses.replace(section, **{field_name: _checked(name, spec, value)})
-        return dataclasses.replace(self, **{section_name: new}) if section_name else new
+        changed: dict[str, Any] = {section_name: new}
+        return dataclasses.replace(self, **changed) if section_name else new
 
     def settings(self) -> dict[str, dataclasses.Field[Any]]:
         """Every setting by its full name."""

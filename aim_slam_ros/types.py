@@ -18,6 +18,9 @@ import numpy as np
 from torch import Tensor
 
 
+GUESSED_CONFIDENCE = 1.05   # a depth with less confidence is filled in, not seen
+
+
 @dataclass(frozen=True)
 class Frame:
     """One admitted image, resized to the model's input size.
@@ -75,6 +78,10 @@ class WindowPrediction:
     K: Tensor
     T_first_cam: Tensor
     rotation_only: bool = False
+
+    def seen_share(self, view: int) -> float:
+        """Share of the view's pixels whose depth was seen; 0 for a view that did not connect."""
+        return float((self.confidence[view, ::4, ::4] > GUESSED_CONFIDENCE).float().mean())
 
 
 @dataclass(frozen=True)

@@ -47,4 +47,5 @@ class UndistortedSequence(Sequence):
         if image.shape[:2] != self._maps[0].shape:
             raise ImageError(f'{self.name}[{index}]',
                              f'is {image.shape[1]}x{image.shape[0]} pixels, unlike the others')
-        return cv2.remap(image, *self._maps, interpolation)
+        map_x, map_y = self._maps
+        return cv2.remap(image, map_x, map_y, interpolation)

@@ -52,15 +52,17 @@ def compare(estimate: StampedPoses, groundtruth: StampedPoses) -> TrajectoryErro
                             f'at least {MIN_POSES} of each are needed')
     if not np.isfinite(estimate.T_world_cam).all():
         return Incomparable('the estimate holds non-finite poses')
+    epoch_ns = int(groundtruth.stamps_ns[0])
     try:
         reference, aligned = sync.associate_trajectories(
-            _to_evo(groundtruth), _to_evo(estimate), max_diff=tolerance_s(groundtruth))
+            _to_evo(groundtruth, epoch_ns), _to_evo(estimate, epoch_ns),
+            max_diff=tolerance_s(groundtruth))
     except sync.SyncException:
         return Incomparable('no pose is close enough in time to a pose of the ground truth')
     if aligned.num_poses < MIN_POSES:
         return Incomparable(f'only {aligned.num_poses} poses are close enough in time to the '
                             f'ground truth: at least {MIN_POSES} are needed')
-    return _aligned_error(aligned, reference)
+    return _aligned_error(aligned, reference, epoch_ns)
 
 
 def tolerance_s(groundtruth: StampedPoses) -> float:
@@ -79,8 +81,8 @@ def length(poses: StampedPoses) -> float:
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 
-def _aligned_error(estimate: PoseTrajectory3D,
-                   reference: PoseTrajectory3D) -> TrajectoryError | Incomparable:
+def _aligned_error(estimate: PoseTrajectory3D, reference: PoseTrajectory3D,
+                   epoch_ns: int) -> TrajectoryError | Incomparable:
     """The error of associated poses; changes ``estimate``."""
     # evo tells a degenerate path by an absolute threshold: a monocular unit must not decide that
     extent = float(np.std(estimate.positions_xyz, axis=0).max())
@@ -90,7 +92,7 @@ def _aligned_error(estimate: PoseTrajectory3D,
     try:
         R, t, scale = estimate.align(reference, correct_scale=True)
     except GeometryException:
-        return Incomparable('the camera moved along a line or not at all: an alignment to the '
+        return Incomparable('the camera moved along a line or not at all: the alignment to the '
                             'ground truth is not determined')
     error = metrics.APE(metrics.PoseRelation.translation_part)
     error.process_data((reference, estimate))
@@ -98,15 +100,16 @@ def _aligned_error(estimate: PoseTrajectory3D,
         ate_rmse_m=float(error.get_statistic(metrics.StatisticsType.rmse)),
         scale=float(scale / extent),
         T_reference_estimate=lie_algebra.sim3(R, t, scale / extent),
-        aligned=_from_evo(estimate), reference=_from_evo(reference),
+        aligned=_from_evo(estimate, epoch_ns), reference=_from_evo(reference, epoch_ns),
         errors_m=np.asarray(error.error, np.float64))
 
 
-def _to_evo(poses: StampedPoses) -> PoseTrajectory3D:
+def _to_evo(poses: StampedPoses, epoch_ns: int) -> PoseTrajectory3D:
+    """Seconds since the epoch: as seconds since 1970 a float64 is only good to 0.2 us."""
     return PoseTrajectory3D(poses_se3=list(poses.T_world_cam.astype(np.float64)),
-                            timestamps=poses.stamps_ns / 1e9)
+                            timestamps=(poses.stamps_ns - epoch_ns) / 1e9)
 
 
-def _from_evo(trajectory: PoseTrajectory3D) -> StampedPoses:
-    stamps_ns = np.round(trajectory.timestamps * 1e9).astype(np.int64)
+def _from_evo(trajectory: PoseTrajectory3D, epoch_ns: int) -> StampedPoses:
+    stamps_ns = np.round(trajectory.timestamps * 1e9).astype(np.int64) + epoch_ns
     return StampedPoses(stamps_ns, np.stack(trajectory.poses_se3))

@@ -17,15 +17,19 @@ from . import camera, sim3
 
 @dataclass(frozen=True)
 class RayMatches:
-    """uv_i: [N,2] sub-pixel position in view i of each point; valid: [N] bool."""
+    """uv_i: [N,2] sub-pixel position in view i of each point; valid: [N] bool.
+
+    points_i: [N,3], the pointmap of view i there.
+    """
 
     uv_i: Tensor
+    points_i: Tensor
     valid: Tensor
 
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """H [7,7] and g [7], float64: the step solves H delta = g."""
+    """H [...,7,7] and g [...,7], float64: the step solves H delta = g."""
 
     H: Tensor
     g: Tensor
@@ -35,19 +39,18 @@ class NormalEquations:
 
 
 def sample(image: Tensor, uv: Tensor) -> Tensor:
-    """Bilinear samples [N,C] of image [H,W,C] at uv [N,2]; nan outside the image."""
+    """Bilinear samples [N,C] of image [H,W,C], H, W > 1, at uv [N,2]; nan outside the image."""
     height, width = image.shape[:2]
     ok = camera.inside(uv, height, width)
     uv = torch.where(ok[:, None], uv, torch.zeros_like(uv))
-    u0 = uv[:, 0].floor().clamp_max(max(width - 2, 0))
-    v0 = uv[:, 1].floor().clamp_max(max(height - 2, 0))
+    u0, v0 = uv[:, 0].floor().clamp_max(width - 2), uv[:, 1].floor().clamp_max(height - 2)
     a, b = (uv[:, 0] - u0)[:, None], (uv[:, 1] - v0)[:, None]
-    flat, at = image.reshape(height * width, -1), (v0 * width + u0).long()
-    right, down = int(width > 1), width * int(height > 1)
-    top = torch.lerp(flat[at], flat[at + right], a)
-    bottom = torch.lerp(flat[at + down], flat[at + down + right], a)
-    values = torch.lerp(top, bottom, b)
-    return torch.where(ok[:, None], values, torch.full_like(values, float('nan')))
+    flat, at = image.reshape(height * width, -1), v0.long() * width + u0.long()
+    corners = torch.stack([at, at + 1, at + width, at + width + 1])
+    found = flat.index_select(0, corners.flatten()).unflatten(
+        0, corners.shape)
+    values = torch.lerp(torch.lerp(found[0], found[1], a), torch.lerp(found[2], found[3], a), b)
+    return values.masked_fill_(~ok[:, None], float('nan'))
 
 
 def match_rays(points_i: Tensor, points_j_in_i: Tensor, K: Tensor, iterations: int = 4,
@@ -56,19 +59,18 @@ def match_rays(points_i: Tensor, points_j_in_i: Tensor, K: Tensor, iterations: i
 
     points_i: [H,W,3] pointmap of view i, in its camera frame. points_j_in_i: [N,3]. K: [3,3].
     With U(p) the projection of the pointmap at p and u* that of the point, p <- p + (u* - U(p)):
-    U is close to the identity, so the map contracts. A match is valid when U(p) ends up within
-    ``tolerance_px`` of u*.
+    U is close to the identity, so the map contracts; where the pointmap was made with this very K,
+    U is the identity at pixel centres and no iteration is needed. A match is valid when U(p) ends
+    up within ``tolerance_px`` of u*.
     """
-    target = camera.project(points_j_in_i, K)
-    uv = target
-    offset = target - camera.project(sample(points_i, uv), K)
+    target = uv = camera.project(points_j_in_i, K)
+    found = sample(points_i, uv)
+    offset = target - camera.project(found, K)
     for _ in range(iterations):
-        # A pointmap made with this very K maps each pixel onto itself: nothing to search.
-        if float(offset.nan_to_num(0.0).abs().max() if len(offset) else 0.0) < 1e-3:
-            break
         uv = uv + offset
-        offset = target - camera.project(sample(points_i, uv), K)
-    return RayMatches(uv, offset.norm(dim=-1) < tolerance_px)
+        found = sample(points_i, uv)
+        offset = target - camera.project(found, K)
+    return RayMatches(uv, found, offset.square().sum(-1) < tolerance_px ** 2)
 
 
 def rays_of(points: Tensor) -> Tensor:
@@ -110,45 +112,55 @@ def pixel_jacobian(points: Tensor, K: Tensor) -> Tensor:
     return torch.stack([K[0, 0] * u, K[1, 1] * v], 1)
 
 
-def ray_normal_equations(points: Tensor, rays: Tensor, log_ratio: Tensor, ray_weight: Tensor,
+def ray_normal_equations(points: Tensor, e_ray: Tensor, e_log: Tensor, ray_weight: Tensor,
                          distance_weight: Tensor) -> NormalEquations:
-    """The ray and log-distance rows' normal equations in closed form, without an [N,4,7] Jacobian.
+    """Ray and log-distance rows in closed form, without [N,4,7] Jacobians (FACTS 4.4).
 
-    points: [N,3], already transformed (X'). rays: [N,3] measured. log_ratio: [N], measured minus
-    predicted log-distance. Weights: [N], inverse variances. Sums run in float64 (FACTS 4.4).
+    points: [P,3,N], already transformed. e_ray: [P,3,N], difference of unit rays. e_log: [P,N].
+    Weights: [P,N], inverse variances. All sums are moments of weights times monomials of the ray:
+    one batched matrix product.
     """
-    d_inv = points.norm(dim=-1).reciprocal()
-    r = points * d_inv[:, None]
+    inv_d = points.square().sum(1).rsqrt()
+    r = points * inv_d[:, None]
     w, v = ray_weight, distance_weight
-    w1, w2, v1 = w * d_inv, w * d_inv * d_inv, v * d_inv
-    v2 = v1 * d_inv
-    along = (r * rays).sum(-1)
-    r64, rays64 = r.double(), rays.double()
-
-    def isotropic(weight: Tensor) -> Tensor:
-        return weight.sum(dtype=torch.float64) * torch.eye(3, dtype=torch.float64,
-                                                           device=weight.device)
-
-    H = torch.zeros(7, 7, dtype=torch.float64, device=points.device)
-    H[:3, :3] = isotropic(w2) + (r64 * (v2 - w2).double()[:, None]).T @ r64
-    H[3:6, 3:6] = isotropic(w) - (r64 * w.double()[:, None]).T @ r64
-    H[:3, 3:6] = -sim3.hat(w1.double() @ r64)
-    H[3:6, :3] = H[:3, 3:6].T
-    H[:3, 6] = H[6, :3] = v1.double() @ r64
-    H[6, 6] = v.sum(dtype=torch.float64)
-    # (I - r r^T) e = m - r (r.m) and r x e = r x m for the residual e = m - r of unit rays.
-    g = torch.cat([w1.double() @ rays64 + (v1 * log_ratio - w1 * along).double() @ r64,
-                   w.double() @ torch.linalg.cross(r, rays).double(),
-                   (v * log_ratio).sum(dtype=torch.float64)[None]])
+    w1, v1 = w * inv_d, v * inv_d
+    w2 = w1 * inv_d
+    # r x e for w, (I - r r^T) e for w/d; r.e does not cancel, unlike r.m - 1.
+    along = v1 * e_log - w1 * (r * e_ray).sum(1)
+    left = torch.stack([w, w1, w2, v, v1, v1 * inv_d - w2, along, v * e_log], 1)
+    x, y, z = r.unbind(1)
+    right = torch.cat([torch.ones_like(w)[:, None], r, r[:, :1] * r, r[:, 1:2] * r[:, 1:],
+                       (z * z)[:, None], e_ray, torch.linalg.cross(r, e_ray, dim=1)], 1)
+    M = (left @ right.mT).double()   # [P,8,16]: the sums
+    outer = M[..., [4, 5, 6, 5, 7, 8, 6, 8, 9]].unflatten(-1, (3, 3))   # sums times r r^T
+    eye = torch.eye(3, dtype=M.dtype, device=M.device)
+    H = M.new_zeros(len(M), 7, 7)
+    H[:, :3, :3] = M[:, 2, 0, None, None] * eye + outer[:, 5]
+    H[:, 3:6, 3:6] = M[:, 0, 0, None, None] * eye - outer[:, 0]
+    H[:, :3, 3:6] = -sim3.hat(M[:, 1, 1:4])
+    H[:, 3:6, :3] = H[:, :3, 3:6].mT
+    H[:, :3, 6] = H[:, 6, :3] = M[:, 4, 1:4]
+    H[:, 6, 6] = M[:, 3, 0]
+    g = torch.cat([M[:, 1, 10:13] + M[:, 6, 1:4], M[:, 0, 13:16], M[:, 7, :1]], -1)
     return NormalEquations(H, g)
 
 
-def pixel_normal_equations(points: Tensor, offset: Tensor, weight: Tensor,
-                           K: Tensor) -> NormalEquations:
+def pixel_normal_equations(points: Tensor, e_px: Tensor, weight: Tensor,
+                           focal: Tensor) -> NormalEquations:
     """The pixel rows' normal equations.
 
-    points: [N,3], already transformed. offset: [N,2] measured minus predicted pixel. weight: [N].
+    points: [P,3,N], already transformed, z > 0. e_px: [P,2,N]. weight: [P,N]. focal: [P,2].
     """
-    J = pixel_jacobian(points, K).reshape(-1, 7)
-    weighted = (J * weight.repeat_interleave(2)[:, None]).double()
-    return NormalEquations(weighted.T @ J.double(), weighted.T @ offset.reshape(-1).double())
+    inv_z = 1.0 / points[:, 2]
+    a, b = points[:, 0] * inv_z, points[:, 1] * inv_z
+    ab = a * b
+    J = points.new_zeros(len(points), 6, 2, points.shape[-1])   # without focal and scale column
+    J[:, 0, 0], J[:, 2, 0], J[:, 3, 0], J[:, 4, 0], J[:, 5, 0] = (
+        inv_z, -a * inv_z, -ab, 1 + a * a, -b)
+    J[:, 1, 1], J[:, 2, 1], J[:, 3, 1], J[:, 4, 1], J[:, 5, 1] = (
+        inv_z, -b * inv_z, -1 - b * b, ab, a)
+    weighted = (J * (weight[:, None] * focal[..., None].square())[:, None]).flatten(2)
+    H, g = points.new_zeros(len(points), 7, 7), points.new_zeros(len(points), 7)
+    H[:, :6, :6] = weighted @ J.flatten(2).mT
+    g[:, :6] = (weighted @ (e_px / focal[..., None]).flatten(1)[..., None])[..., 0]
+    return NormalEquations(H.double(), g.double())

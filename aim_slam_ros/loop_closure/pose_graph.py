@@ -2,8 +2,8 @@
 
 GTSAM's Similarity3 acts as ``s (R p + t)``, its tangent is (rotation, translation, log-scale) and
 it perturbs on the right; ours acts as ``s R p + t`` with (translation, rotation, log-scale) on the
-left. The generators differ only by a multiple of the identity, so the same seven numbers, permuted,
-describe the same transform; covariances cross over by the adjoint.
+left. The generators differ only by a multiple of the identity, so the same seven numbers,
+permuted, describe the same transform; covariances cross over by the adjoint.
 """
 
 from __future__ import annotations
@@ -137,6 +137,15 @@ class PoseGraph:
             reached = reached | frontier
         return reached
 
+    def neighbourhood(self, keyframe_id: int, hops: int, gap: int) -> set[int]:
+        """Keyframes that may see the same without any loop: some edges away, or just before.
+
+        gap: in keyframes; those of another component do not count as just before.
+        """
+        recent = list(self._neighbours)[-gap:]
+        own = self._component[keyframe_id]
+        return self.within(keyframe_id, hops) | {k for k in recent if self._component[k] == own}
+
     def optimise(self) -> dict[int, Tensor]:
         """Batch Levenberg-Marquardt from the present poses; every T_world_kf [4,4] float64.
 
@@ -149,7 +158,8 @@ class PoseGraph:
             estimator = gtsam.noiseModel.mEstimator.Cauchy.Create(width)
             for factor in self._robust:
                 noise = gtsam.noiseModel.Robust.Create(estimator, factor.noiseModel())
-                graph.add(gtsam.BetweenFactorSimilarity3(*factor.keys(), factor.measured(), noise))
+                a, b = factor.keys()
+                graph.add(gtsam.BetweenFactorSimilarity3(a, b, factor.measured(), noise))
             optimiser = gtsam.LevenbergMarquardtOptimizer(graph, self._values)
             self._values = optimiser.optimize()
         return self.poses()

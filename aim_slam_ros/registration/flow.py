@@ -7,23 +7,12 @@ have (they agree by construction); what the images say about them does.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Sequence
-
 import cv2
 import numpy as np
 
 WINDOW_PX = 21
 LEVELS = 3
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.02)
-
-
-@dataclass(frozen=True)
-class Pyramid:
-    """An image pyramid with gradients, as OpenCV's optical flow takes it."""
-
-    levels: Sequence[np.ndarray]
-    height: int
-    width: int
 
 
 @dataclass(frozen=True)
@@ -34,24 +23,18 @@ class FlowMatches:
     valid: np.ndarray
 
 
-def build_pyramid(grey: np.ndarray) -> Pyramid:
-    """Grey [H,W] uint8 to its pyramid; build it once per image."""
-    _, levels = cv2.buildOpticalFlowPyramid(grey, (WINDOW_PX, WINDOW_PX), LEVELS)
-    return Pyramid(levels, *grey.shape)
-
-
-def _flow(a: Pyramid, b: Pyramid, uv_a: np.ndarray, uv_b: np.ndarray,
+def _flow(a: np.ndarray, b: np.ndarray, uv_a: np.ndarray, uv_b: np.ndarray,
           levels: int) -> tuple[np.ndarray, np.ndarray]:
     found, status, _ = cv2.calcOpticalFlowPyrLK(
-        a.levels, b.levels, uv_a, uv_b.copy(), winSize=(WINDOW_PX, WINDOW_PX), maxLevel=levels,
+        a, b, uv_a, uv_b.copy(), winSize=(WINDOW_PX, WINDOW_PX), maxLevel=levels,
         criteria=_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4)
     return found, status[:, 0].astype(bool)
 
 
-def refine(a: Pyramid, b: Pyramid, uv_a: np.ndarray, uv_b_predicted: np.ndarray,
+def refine(a: np.ndarray, b: np.ndarray, uv_a: np.ndarray, uv_b_predicted: np.ndarray,
            max_move_px: float = 14.0, max_round_trip_px: float = 0.7,
            levels: int = LEVELS) -> FlowMatches:
-    """Find the points uv_a [N,2] of image a in image b, starting where they are predicted.
+    """Find the points uv_a [N,2] of image a in image b ([H,W] uint8 both), starting where they are predicted.
 
     A match is valid when it stays within max_move_px of its prediction, inside the image, and
     flowing back from it returns to within max_round_trip_px of where it started. Predictions that
@@ -76,6 +59,6 @@ def refine(a: Pyramid, b: Pyramid, uv_a: np.ndarray, uv_b_predicted: np.ndarray,
     return FlowMatches(uv_b, valid)
 
 
-def _inside(uv: np.ndarray, image: Pyramid) -> np.ndarray:
+def _inside(uv: np.ndarray, image: np.ndarray) -> np.ndarray:
     with np.errstate(invalid='ignore'):
-        return ((uv >= 0) & (uv <= (image.width - 1, image.height - 1))).all(axis=1)
+        return ((uv >= 0) & (uv <= (image.shape[1] - 1, image.shape[0] - 1))).all(axis=1)

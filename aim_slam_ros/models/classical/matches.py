@@ -59,19 +59,6 @@ class Matcher:
         return PairMatches(rows_a[good].numpy(), rows_b[good, 0].numpy())
 
 
-def rotation_between(rays_a: Tensor, rays_b: Tensor) -> Tensor:
-    """R_b_a [3,3] float64 that best turns the unit rays [M,3] of a into those of b, robustly."""
-    weights = torch.ones(len(rays_a), dtype=torch.float64)
-    R = torch.eye(3, dtype=torch.float64)
-    for _ in range(6):
-        U, _, Vt = torch.linalg.svd((weights[:, None] * rays_b).T @ rays_a)
-        flip = torch.diag(torch.tensor([1.0, 1.0, float(torch.linalg.det(U @ Vt))]).double())
-        R = U @ flip @ Vt
-        residual = (rays_b - rays_a @ R.T).norm(dim=1)
-        weights = 1.0 / (residual ** 2 + (residual.median() + 1e-6) ** 2)
-    return R
-
-
 def essential_pose(uv_a: np.ndarray, uv_b: np.ndarray, K_a: Tensor,
                    K_b: Tensor) -> tuple[Tensor, np.ndarray] | None:
     """T_b_a [4,4] with a translation of unit length, and inliers [M] bool; None if there is none.

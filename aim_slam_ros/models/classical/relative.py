@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from ...config import ClassicalConfig
-from ...geometry import sim3
+from ...geometry import rotation, sim3
 from .bundle import MIN_RHO, Adjusted, Bundle, Observations, adjust
 from .features import ClassicalFeatures
-from .matches import Matcher, PairMatches, essential_pose, rotation_between
+from .matches import Matcher, PairMatches, essential_pose
 
 _OUTLIER_PX = 3.0
 _MAX_RELATIVE_SIGMA = 0.12   # sparse points with a worse depth are not used
@@ -104,13 +104,12 @@ def _pairs(hub: int, features: Sequence[ClassicalFeatures], K: Sequence[Tensor],
             continue
         uv_hub = features[hub].uv[matches.rows_a]
         uv = features[view].uv[matches.rows_b]
-        xy_hub, xy = _normalised(uv_hub, K[hub]), _normalised(uv, K[view])
-        rays_hub, rays = (torch.from_numpy(_rays(x)) for x in (xy_hub, xy))
-        unit_hub, unit = rays_hub / rays_hub.norm(dim=1, keepdim=True), \
-            rays / rays.norm(dim=1, keepdim=True)
-        R = rotation_between(unit_hub, unit)
-        parallax = float((unit - unit_hub @ R.T).norm(dim=1).median() * K[hub][0, 0])
-        pairs.append(_Pair(view, matches.rows_a, uv_hub, uv, xy, R, parallax))
+        rays_hub = rotation.unit_rays(torch.from_numpy(uv_hub), K[hub])
+        rays = rotation.unit_rays(torch.from_numpy(uv), K[view])
+        R = rotation.fit_rotation(rays_hub, rays)
+        parallax = rotation.parallax_px(rays_hub, rays, R, float(K[hub][0, 0]))
+        pairs.append(_Pair(view, matches.rows_a, uv_hub, uv, _normalised(uv, K[view]), R,
+                           parallax))
     return pairs
 
 

@@ -87,6 +87,7 @@ def agreement(view: SweepDepth, K: np.ndarray, other: SweepDepth, K_other: np.nd
               T_other_view: np.ndarray) -> np.ndarray:
     """[h,w] in 0..1: how well another view's depth agrees where this view's depth lands in it."""
     h, w = view.rho.shape
+    K, K_other = K.astype(np.float32), K_other.astype(np.float32)
     v, u = np.mgrid[:h, :w].astype(np.float32)
     x, y = (u - K[0, 2]) / K[0, 0] / view.rho, (v - K[1, 2]) / K[1, 1] / view.rho
     R, t = T_other_view[:3, :3].astype(np.float32), T_other_view[:3, 3].astype(np.float32)

@@ -1,0 +1,98 @@
+"""Run both pipelines over a recorded dataset and write what came out."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any, Sequence
+
+from aim_slam_ros.cli.arguments import (Refusal, assignment, configured, selection, settings_text,
+                                        whole_number, writable_folder)
+from aim_slam_ros.config import Config
+
+# torch and matplotlib take seconds to import: what needs them is imported in _evaluate, after the
+# command line has been found good.
+
+_INTERRUPTED = 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit status: 0 done, 2 refused, 130 interrupted (with everything until then written)."""
+    try:
+        args = _parser().parse_args(argv)
+        config = configured(_assignments(args))
+        writable_folder(args.out)
+        return _evaluate(args, config)
+    except SystemExit as stop:      # argparse has said why
+        return int(stop.code or 0)
+    except Refusal as refusal:
+        print(f'evaluate: error: {refusal}', file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print('evaluate: interrupted, nothing more is written', file=sys.stderr)
+        return _INTERRUPTED
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='evaluate', description=__doc__, allow_abbrev=False,
+        epilog='Writes trajectory.txt, keyframes.txt, map.ply, config.yaml, metrics.json and '
+               'report.png. Ctrl-C ends the run early and writes what there is.')
+    parser.add_argument('dataset', metavar='DATASET',
+                        help='a TUM RGB-D folder, a EuRoC folder, a folder of images, a video, '
+                             'rendered:room or rendered:corridor')
+    parser.add_argument('--out', metavar='DIR', type=Path, required=True,
+                        help='where the results go; files of an earlier run are replaced')
+    parser.add_argument('--model', metavar='M', help='the geometry model (model.name)')
+    parser.add_argument('--stride', metavar='K', type=whole_number(1), default=1,
+                        help='take every K-th image (default 1)')
+    parser.add_argument('--start', metavar='S', type=whole_number(0), default=0,
+                        help='the first image, counted from 0')
+    parser.add_argument('--count', metavar='N', type=whole_number(1),
+                        help='look at the N images from the first one on, before --stride')
+    parser.add_argument('--set', metavar='section.name=value', type=assignment, action='append',
+                        default=[], dest='settings', help='change a setting; may be repeated')
+    parser.add_argument('--no-loop-closure', action='store_true')
+    parser.add_argument('--seed', metavar='N', help='seed of every random choice')
+    parser.add_argument('--undistort', action='store_true',
+                        help='remove lens distortion from the images; needs a calibration')
+    parser.add_argument('--list-settings', action=_ListSettings, nargs=0,
+                        help='show every setting with its default and range, and exit')
+    return parser
+
+
+class _ListSettings(argparse.Action):
+    """Like --help: answers and exits, whatever else is missing."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *unused: Any) -> None:
+        print(settings_text())
+        parser.exit()
+
+
+def _assignments(args: argparse.Namespace) -> list[tuple[str, str]]:
+    """--set and the options that are short for one; those win."""
+    short = {'model.name': args.model, 'seed': args.seed,
+             'loop_closure.enabled': 'false' if args.no_loop_closure else None}
+    return args.settings + [(name, value) for name, value in short.items() if value is not None]
+
+
+def _evaluate(args: argparse.Namespace, config: Config) -> int:
+    from aim_slam_ros.datasets import DatasetError, load_sequence
+    try:
+        sequence = load_sequence(args.dataset, undistort=args.undistort)
+    except DatasetError as error:
+        raise Refusal(str(error)) from error
+    indices = selection(len(sequence), args.start, args.count, args.stride)
+
+    from aim_slam_ros import offline
+    from aim_slam_ros.cli.progress import progress_bar
+    from aim_slam_ros.cli.results import write_results
+    with progress_bar(len(indices)) as progress:
+        run = offline.run(sequence, config, indices, progress)
+    write_results(args.out, sequence, config, run)
+    return _INTERRUPTED if run.interrupted else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

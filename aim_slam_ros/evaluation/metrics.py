@@ -1,0 +1,84 @@
+"""The figures of a run, flat, as metrics.json holds them."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Mapping, Sequence
+
+from aim_slam_ros.evaluation.run_result import RunResult
+from aim_slam_ros.evaluation.trajectory import Incomparable, TrajectoryError, compare, length
+from aim_slam_ros.types import StampedPoses, TrackingStatus
+
+Metric = float | int | str | bool | None
+_MODEL_STAGES = ('encode', 'infer')
+
+
+def compute(run: RunResult, groundtruth: StampedPoses | None,
+            final: TrajectoryError | Incomparable) -> dict[str, Metric]:
+    """Every figure that follows from a run; None where it is not available.
+
+    final: the error of ``run.trajectory``.
+    """
+    causal = _rmse(compare(run.causal_trajectory, groundtruth)) if groundtruth else None
+    return {
+        'ate_rmse_m': _rmse(final),
+        'ate_rmse_causal_m': causal,
+        **_counts(run),
+        **_rates(run),
+        'trajectory_length_m': length(groundtruth) if groundtruth else None,
+        'interrupted': run.interrupted,
+        **{f'stage_{name}_ms_per_frame': _ratio(1e3 * seconds, run.offered)
+           for name, seconds in run.stage_s.items()},
+    }
+
+
+def write(path: Path, metrics: Mapping[str, Metric]) -> None:
+    """JSON; a figure that is not finite becomes null, since JSON knows no NaN."""
+    clean = {name: None if isinstance(value, float) and not math.isfinite(value) else value
+             for name, value in metrics.items()}
+    path.write_text(json.dumps(clean, indent=2, allow_nan=False) + '\n', encoding='utf-8')
+
+
+def _counts(run: RunResult) -> dict[str, Metric]:
+    """A frame is tracked only when its pose belongs to the largest connected map."""
+    tracked = len(run.tracked)
+    return {
+        'frames_offered': run.offered,
+        'frames_tracked': tracked,
+        'tracked_percent': _ratio(100.0 * tracked, run.offered),
+        'frames_skipped': run.count(TrackingStatus.SKIPPED),
+        'frames_unreadable': len(run.unreadable),
+        'frames_lost': run.count(TrackingStatus.LOST),
+        'frames_initialising': run.count(TrackingStatus.INITIALISING),
+        'map_pieces': len({keyframe.piece_id for keyframe in run.keyframes}),
+        'map_points': len(run.map_cloud.points),
+        'keyframes': len(run.keyframes),
+        'loops': len(run.loops),
+        'inferences': sum(result.inferences for result in run.results),
+        'rotation_only_inferences': run.rotation_only_inferences,
+        'mean_window': _mean([len(r.window) for r in run.results if r.window]),
+        'mean_kappa': _mean([r.kappa for r in run.results
+                             if r.kappa is not None and math.isfinite(r.kappa)]),
+    }
+
+
+def _rates(run: RunResult) -> dict[str, Metric]:
+    """Frames per second from the first image read to the last result, with and without model."""
+    model_s = sum(run.stage_s.get(name, 0.0) for name in _MODEL_STAGES)
+    return {'wall_s': run.wall_s,
+            'rate_hz': _ratio(run.offered, run.wall_s),
+            'rate_without_model_hz': _ratio(run.offered, run.wall_s - model_s)}
+
+
+def _rmse(error: TrajectoryError | Incomparable) -> float | None:
+    return error.ate_rmse_m if isinstance(error, TrajectoryError) else None
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None
+
+
+def _ratio(numerator: float, denominator: float) -> float | None:
+    return numerator / denominator if denominator > 0 else None

@@ -1,0 +1,61 @@
+"""An inference brought to the units of the map: every inference has a scale of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ..geometry import camera, sim3
+from ..registration.scale import ScaleEstimate, log_depth_ratio
+from ..types import Keyframe, WindowPrediction
+from .tracking import TrackingWindow
+
+_GRID = 4   # every fourth pixel, both ways: medians need no more
+
+
+def unit_of(keyframe: Keyframe, prediction: WindowPrediction, view: int) -> ScaleEstimate:
+    """The factor from the prediction's unit to the keyframe's, from their depths."""
+    stored = keyframe.points_cam[::_GRID, ::_GRID, 2].reshape(-1)
+    weight = ((keyframe.confidence[::_GRID, ::_GRID] - 1.0)
+              * (prediction.confidence[view, ::_GRID, ::_GRID] - 1.0)).clamp_min(0.0).sqrt()
+    return log_depth_ratio(stored, prediction.depth[view, ::_GRID, ::_GRID].reshape(-1),
+                           weight.reshape(-1))
+
+
+def pose_mean(window: TrackingWindow, min_seen: float) -> Tensor | None:
+    """The mean over the keyframes of where the model puts the frame: Sim(3) [4,4], or None.
+
+    Views of which the model saw a smaller share than min_seen have no say.
+    """
+    prediction, guesses, weights = window.prediction, [], []
+    for view, keyframe in enumerate(window.keyframes, 1):
+        seen = prediction.seen_share(view)
+        unit = unit_of(keyframe, prediction, view)
+        if seen < min_seen or not unit.count:
+            continue
+        T_kf_first = sim3.with_scale(sim3.identity(), unit.scale) \
+            @ sim3.inverse(prediction.T_first_cam[view])
+        guesses.append(keyframe.T_world_kf @ T_kf_first)
+        weights.append(seen)
+    if not guesses:
+        return None
+    return sim3.mean(torch.stack(guesses), torch.tensor(weights, dtype=torch.float64))
+
+
+def fused(keyframe: Keyframe, prediction: WindowPrediction, view: int, scale: float) -> Keyframe:
+    """The keyframe with one more observation: confidence-weighted averages (paper, III-D).
+
+    Points are averaged in log depth along the keyframe's own rays, which keeps them on the rays
+    they were seen on; the focal length is averaged recursively.
+    """
+    depth = keyframe.points_cam[..., 2]
+    weight = prediction.confidence[view] - 1.0
+    total = (keyframe.confidence - 1.0) + weight
+    step = weight / total.clamp_min(1e-6) * torch.log(scale * prediction.depth[view] / depth)
+    n = keyframe.observations
+    K = keyframe.K.clone()
+    K[:2, :2] = (n * K[:2, :2] + prediction.K[view][:2, :2]) / (n + 1)
+    points = camera.unproject(depth * torch.exp(step), K)
+    return replace(keyframe, points_cam=points, confidence=1.0 + total, K=K, observations=n + 1)

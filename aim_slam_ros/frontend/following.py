@@ -1,0 +1,131 @@
+"""A pose for every image, from optical flow of the keyframes' points: no inference needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..config import FollowingConfig
+from ..geometry import camera, sim3
+from ..registration.flow import LEVELS, refine
+from ..registration.rigid import RigidSolution, solve_rigid, solve_rigid_from_scratch
+from ..types import Keyframe
+from .landmarks import LandmarkCache
+
+_SEARCH_PX = 90.0      # how far a point may be from a prediction by motion alone
+_SETTLED_PX = 3.0      # a smaller correction of the prediction needs no second look
+_TIGHT_PX = 10.0
+
+
+@dataclass(frozen=True)
+class Followed:
+    """ok: the pose can be trusted. T_world_cam: [4,4] rigid.
+
+    fractions: by reference id, the share of its points that were found and explained; the first
+    reference's is matched_fraction. points_world [M,3], uv [M,2]: what was found and explained.
+    """
+
+    ok: bool
+    T_world_cam: Tensor
+    matched_fraction: float
+    fractions: dict[int, float]
+    points_world: np.ndarray
+    uv: np.ndarray
+    reason: str = ''
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Points of all references found in the image, one row each."""
+
+    owner: np.ndarray
+    points_world: np.ndarray
+    spread_world: np.ndarray
+    uv: np.ndarray
+    move_px: float
+
+
+class Follower:
+    """Finds the camera of an image among the keyframes it is followed against."""
+
+    def __init__(self, config: FollowingConfig, landmarks: LandmarkCache) -> None:
+        self._config = config
+        self._landmarks = landmarks
+
+    def follow(self, grey: np.ndarray, K: Tensor, T_world_cam_guess: Tensor,
+               references: Sequence[Keyframe]) -> Followed:
+        """references: the one that counts for matched_fraction first. K: [3,3] of the image."""
+        found = self._find(grey, K, T_world_cam_guess, references, _SEARCH_PX, LEVELS)
+        solution = self._solve(found, K, T_world_cam_guess)
+        if solution is not None and found.move_px > _SETTLED_PX:
+            T_world_cam = sim3.inverse(solution.T_cam_ref)
+            found = self._find(grey, K, T_world_cam, references, _TIGHT_PX, 1)
+            solution = self._solve(found, K, T_world_cam)
+        return self._followed(found, solution, T_world_cam_guess, references)
+
+    def _find(self, grey: np.ndarray, K: Tensor, T_world_cam: Tensor,
+              references: Sequence[Keyframe], reach_px: float, levels: int) -> _Found:
+        owners, points, spreads, pixels, moves = [], [], [], [], []
+        T_cam_world = sim3.inverse(T_world_cam)
+        for index, keyframe in enumerate(references):
+            landmarks = self._landmarks.of(keyframe)
+            points_cam = landmarks.points(keyframe)
+            sigma = landmarks.relative_sigma(keyframe, self._config.sigma_depth)
+            T = keyframe.T_world_kf.numpy()
+            world = points_cam @ T[:3, :3].T + T[:3, 3]
+            uv = camera.project(sim3.transform(T_cam_world, torch.from_numpy(world)), K).numpy()
+            matches = refine(keyframe.frame.grey, grey, landmarks.uv, uv, reach_px, levels=levels)
+            hit = matches.valid
+            owners.append(np.full(int(hit.sum()), index))
+            points.append(world[hit])
+            spreads.append((world[hit] - T[:3, 3]) * sigma[hit, None])
+            pixels.append(matches.uv_b[hit])
+            moves.append(np.linalg.norm(matches.uv_b[hit] - uv[hit], axis=1))
+        moved = np.concatenate(moves)
+        return _Found(np.concatenate(owners), np.concatenate(points), np.concatenate(spreads),
+                      np.concatenate(pixels), float(np.median(moved)) if moved.size else 0.0)
+
+    def _solve(self, found: _Found, K: Tensor, T_world_cam: Tensor) -> RigidSolution | None:
+        """From the guess, or where that explains too little, from scratch."""
+        if len(found.uv) < self._config.min_inliers:
+            return None
+        best = None
+        for T_cam_world in (sim3.inverse(T_world_cam), None):
+            if T_cam_world is None:
+                T_cam_world = solve_rigid_from_scratch(found.points_world, found.uv, K)
+                if T_cam_world is None:
+                    break
+            solution = solve_rigid(found.points_world, found.uv, K, T_cam_world,
+                                   found.spread_world, self._config.sigma_px)
+            if best is None or solution.inliers.sum() > best.inliers.sum():
+                best = solution
+            if best.inliers.mean() >= self._config.min_inlier_ratio:
+                break
+        return best
+
+    def _followed(self, found: _Found, solution: RigidSolution | None, T_guess: Tensor,
+                  references: Sequence[Keyframe]) -> Followed:
+        if solution is None:
+            return _nothing(T_guess, f'only {len(found.uv)} points were found again')
+        inliers = solution.inliers
+        explained = int(inliers.sum())
+        fractions = {
+            keyframe.keyframe_id: float((found.owner[inliers] == index).sum())
+            / max(1, len(self._landmarks.of(keyframe).uv))
+            for index, keyframe in enumerate(references)}
+        reason = ''
+        if explained < self._config.min_inliers:
+            reason = f'a pose explains only {explained} points'
+        elif inliers.mean() < self._config.min_inlier_ratio:
+            reason = f'a pose explains only {explained} of {len(inliers)} found points'
+        return Followed(not reason, sim3.inverse(solution.T_cam_ref),
+                        fractions[references[0].keyframe_id], fractions,
+                        found.points_world[inliers], found.uv[inliers], reason)
+
+
+def _nothing(T_world_cam: Tensor, reason: str) -> Followed:
+    return Followed(False, T_world_cam, 0.0, {}, np.zeros((0, 3)), np.zeros((0, 2)), reason)

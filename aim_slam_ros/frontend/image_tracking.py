@@ -1,0 +1,94 @@
+"""The default tracker: the inference predicts dense matches, the images refine them.
+
+Matches that come from the inference whose poses are then optimised carry no new information
+(FACTS 10), so the prediction is only where the search in the images starts.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..config import FollowingConfig, TrackingConfig
+from ..geometry import camera, sim3
+from ..registration.flow import refine
+from ..registration.rigid import RigidSolution, solve_rigid
+from ..registration.scale import log_depth_ratio
+from ..types import Keyframe
+from .alignment import pose_mean
+from .landmarks import relative_depth_sigma
+from .matching import PredictedMatches, predict_matches
+from .tracking import TrackingResult, TrackingWindow
+
+
+class ImageTracker:
+    """Rigid part from refined matches of stored points, scale from depth ratios (DESIGN 7)."""
+
+    def __init__(self, config: TrackingConfig, following: FollowingConfig,
+                 min_seen: float) -> None:
+        self._config = config
+        self._following = following
+        self._min_seen = min_seen
+
+    def track(self, window: TrackingWindow) -> TrackingResult:
+        """Keyframes stay where they are. Fails where neither model nor images place the frame."""
+        start = pose_mean(window, self._min_seen)
+        guess = window.T_world_frame_guess
+        if guess is None and start is None:
+            return _failed('the model connected the image with no keyframe of its window')
+        rigid_start = sim3.rigid_part(guess if guess is not None else start)
+        matches, solution = self._refined(window, rigid_start)
+        if solution is None or self._strays(rigid_start, solution, matches):
+            return self._fallback(start, matches)
+        T_world_cam = sim3.inverse(solution.T_cam_ref)
+        scale = self._scale(window, matches, solution)
+        if not scale:
+            return self._fallback(start, matches)
+        return TrackingResult(True, sim3.with_scale(T_world_cam, scale), solution.kappa,
+                              matches.best_fraction(solution.inliers))
+
+    def _refined(self, window: TrackingWindow,
+                 T_world_cam: Tensor) -> tuple[PredictedMatches, RigidSolution | None]:
+        K = window.prediction.K[0]
+        matches = predict_matches(window.keyframes, window.frame.grey, K, T_world_cam, self._config.stride,
+                                  self._following.sigma_depth)
+        if len(matches.uv) < self._config.min_matches:
+            return matches, None
+        return matches, solve_rigid(matches.points_world, matches.uv, K,
+                                    sim3.inverse(T_world_cam), matches.spread_world,
+                                    self._config.sigma_px)
+
+    def _strays(self, T_start: Tensor, solution: RigidSolution,
+                matches: PredictedMatches) -> bool:
+        """Whether the solve left the basin that its matches were predicted in."""
+        T_world_cam = sim3.inverse(solution.T_cam_ref)
+        depth = sim3.transform(solution.T_cam_ref, torch.from_numpy(matches.points_world))[:, 2]
+        moved = float((T_world_cam - T_start)[:3, 3].norm()) / max(float(depth.median()), 1e-9)
+        return moved > self._config.max_stray \
+            or solution.inliers.sum() < self._config.min_matches
+
+    def _scale(self, window: TrackingWindow, matches: PredictedMatches,
+               solution: RigidSolution) -> float:
+        """From the prediction's unit to the world's, at the matched pixels; 0 where unknown."""
+        rows = solution.inliers
+        z = sim3.transform(solution.T_cam_ref, torch.from_numpy(matches.points_world[rows]))[:, 2]
+        u, v = np.rint(matches.uv[rows]).astype(np.int64).T
+        predicted = window.prediction.depth[0][v, u]
+        weight = (window.prediction.confidence[0][v, u] - 1.0).clamp_min(0.0)
+        ratio = log_depth_ratio(z, predicted,
+                                weight.sqrt() * torch.from_numpy(matches.weight[rows]))
+        return ratio.scale if ratio.count else 0.0
+
+    def _fallback(self, start: Tensor | None, matches: PredictedMatches) -> TrackingResult:
+        """The model's own word, where the images have none."""
+        if start is None:
+            return _failed(f'only {len(matches.uv)} matches were found in the images and the '
+                           'model did not connect the window')
+        return TrackingResult(True, start, math.inf, matches.best_fraction(None))
+
+
+def _failed(reason: str) -> TrackingResult:
+    return TrackingResult(False, sim3.identity(), math.inf, 0.0, {}, reason)

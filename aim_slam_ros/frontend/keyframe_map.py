@@ -1,0 +1,130 @@
+"""The keyframes: their world poses, their pointmaps, and who sees what (sole writer of all)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Sequence
+
+import torch
+from torch import Tensor
+
+from ..config import SigmaConfig
+from ..geometry import sim3
+from ..types import CorrectedKeyframes, FrameEncoding, Keyframe, KeyframePose
+from .sigma import candidates
+from .voxel_index import VoxelIndex, confident_points, relative_voxel_size
+
+_MOVED = 0.02   # of the median depth: a keyframe that moved less stays in its voxels
+
+
+class KeyframeMap:
+    """Keyframes in pieces: the keyframes of one piece share a world, two pieces do not."""
+
+    def __init__(self, config: SigmaConfig) -> None:
+        self._config = config
+        self._keyframes: dict[int, Keyframe] = {}
+        self._piece_ids: list[int] = []
+        self._moved: set[int] = set()
+        self._descriptors: list[Tensor] = []
+        self.piece_id = 0
+        self._index: VoxelIndex | None = None
+
+    def __getitem__(self, keyframe_id: int) -> Keyframe:
+        return self._keyframes[keyframe_id]
+
+    @property
+    def all(self) -> tuple[Keyframe, ...]:
+        """Every keyframe of every piece, oldest first."""
+        return tuple(self._keyframes.values())
+
+    @property
+    def piece(self) -> tuple[Keyframe, ...]:
+        """The keyframes of the current piece, oldest first."""
+        return tuple(self._keyframes[i] for i in self._piece_ids)
+
+    @property
+    def last(self) -> Keyframe:
+        """The newest keyframe of the current piece."""
+        return self._keyframes[self._piece_ids[-1]]
+
+    def begin_piece(self) -> None:
+        """Start a new, unconnected map; the first piece needs no call."""
+        self.piece_id += 1
+        self._piece_ids = []
+        self._index = None
+
+    def add(self, encoding: FrameEncoding, K: Tensor, points_cam: Tensor, confidence: Tensor,
+            T_world_kf: Tensor) -> Keyframe:
+        """A new keyframe; the points in its own unit, the scale in its pose."""
+        keyframe = Keyframe(len(self._keyframes), self.piece_id, encoding, K, points_cam,
+                            confidence, T_world_kf)
+        self._keyframes[keyframe.keyframe_id] = keyframe
+        self._piece_ids.append(keyframe.keyframe_id)
+        self._descriptors.append(encoding.descriptor)
+        if self._index is None:
+            self._index = VoxelIndex(relative_voxel_size(keyframe, self._config))
+        self._index.insert(keyframe.keyframe_id, confident_points(keyframe, self._config))
+        return keyframe
+
+    def fuse(self, keyframe: Keyframe) -> None:
+        """Take over a keyframe whose pointmap has grown by an observation."""
+        self._keyframes[keyframe.keyframe_id] = keyframe
+
+    def move(self, poses: Sequence[KeyframePose]) -> None:
+        """New poses T_world_kf for keyframes of this map."""
+        for pose in poses:
+            old = self._keyframes[pose.keyframe_id]
+            keyframe = replace(old, T_world_kf=pose.T_world_kf)
+            self._keyframes[pose.keyframe_id] = keyframe
+            self._moved.add(pose.keyframe_id)
+            if keyframe.piece_id == self.piece_id and _displacement(old, keyframe) > _MOVED:
+                self._reindex(keyframe)
+
+    def _reindex(self, keyframe: Keyframe) -> None:
+        if self._index is not None:
+            self._index.move(keyframe.keyframe_id, confident_points(keyframe, self._config))
+
+    def take_moved(self, except_id: int) -> tuple[KeyframePose, ...]:
+        """What moved since the last call."""
+        moved = sorted(self._moved - {except_id})
+        self._moved.clear()
+        return tuple(KeyframePose(i, self._keyframes[i].T_world_kf) for i in moved)
+
+    def correct(self, corrected: CorrectedKeyframes) -> None:
+        """Take the poses of a pose-graph optimisation.
+
+        Keyframes newer than it move along with the newest one that it knows.
+        """
+        known = {pose.keyframe_id: pose.T_world_kf for pose in corrected.poses
+                 if pose.keyframe_id in self._keyframes}
+        if not known:
+            return
+        newest = max(known)
+        T_new_old = known[newest] @ sim3.inverse(self._keyframes[newest].T_world_kf)
+        poses = [KeyframePose(i, T) for i, T in known.items()]
+        poses += [KeyframePose(i, T_new_old @ self._keyframes[i].T_world_kf)
+                  for i in self._piece_ids if i > newest]
+        self.move(poses)
+
+    def overlapping(self, keyframe_id: int) -> tuple[Keyframe, ...]:
+        """The piece's other keyframes by shared voxels, most first (paper, SIGMA a)."""
+        if self._index is None:
+            return ()
+        return tuple(self._keyframes[i]
+                     for i in candidates(self._index, keyframe_id, self._config))
+
+    def similar(self, descriptor: Tensor, count: int) -> list[Keyframe]:
+        """Keyframes of the current piece by descriptor similarity, best first."""
+        if not self._piece_ids:
+            return []
+        table = torch.stack([self._descriptors[i] for i in self._piece_ids])
+        best = (table @ descriptor).topk(min(count, len(table))).indices
+        return [self._keyframes[self._piece_ids[int(i)]] for i in best]
+
+
+def _displacement(old: Keyframe, new: Keyframe) -> float:
+    """How far the middle of what it sees moved, relative to its distance."""
+    middle = old.points_cam[::8, ::8].reshape(-1, 3).nanmedian(dim=0).values.double()
+    a, b = (sim3.transform(k.T_world_kf, middle) for k in (old, new))
+    reach = (a - sim3.translation_of(old.T_world_kf)).norm().clamp_min(1e-9)
+    return float((a - b).norm() / reach)

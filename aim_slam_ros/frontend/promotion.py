@@ -1,0 +1,112 @@
+"""A tracked image becomes a keyframe, and the window's keyframes learn from the inference."""
+
+from __future__ import annotations
+
+from typing import Sequence
+
+import numpy as np
+import torch
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from torch import Tensor
+
+from ..config import KeyframesConfig
+from ..geometry import camera, sim3
+from ..types import (Frame, FrameEncoding, Keyframe, KeyframeEvent, PoseEdge,
+                     WindowPrediction)
+from .alignment import fused, unit_of
+from .following import Followed
+from .initialisation import Beginning
+from .keyframe_map import KeyframeMap
+from .window import WindowEstimate
+
+_CARRIED = 1.2        # confidence of a depth carried over from older keyframes, at its points
+_BETWEEN = 1.02       # and between them
+_EDGE_SIGMA = (0.02, 0.02, 0.02, 0.006, 0.006, 0.006, 0.02)   # translation by median depth
+
+
+class Promotion:
+    """Writes new keyframes and fused observations into the map."""
+
+    def __init__(self, config: KeyframesConfig, keyframes: KeyframeMap) -> None:
+        self._config = config
+        self._map = keyframes
+
+    def begin(self, beginning: Beginning) -> list[Keyframe]:
+        """The first keyframes of a piece: the oldest view is the world, then the current one."""
+        prediction = beginning.prediction
+        if beginning.measured and len(beginning.encodings) > 1:
+            T_world_current = sim3.inverse(prediction.T_first_cam[1])
+            return [self._add(beginning.encodings[1], prediction, 1, sim3.identity()),
+                    self._add(beginning.encodings[0], prediction, 0, T_world_current)]
+        return [self._add(beginning.encodings[0], prediction, 0, sim3.identity())]
+
+    def promote(self, encoding: FrameEncoding, followed: Followed, estimate: WindowEstimate,
+                K: Tensor) -> Keyframe | None:
+        """A keyframe with the inference's own depth, its unit in the pose's scale.
+
+        Where the inference did not measure any (motion without parallax, for a model that needs
+        it), with the depth of the followed points; None where there are none either.
+        """
+        prediction = estimate.prediction
+        if (estimate.ok and not prediction.rotation_only
+                and prediction.seen_share(0) >= self._config.min_confident):
+            return self._add(encoding, prediction, 0, estimate.result.T_world_frame)
+        if not followed.ok:
+            return None
+        points, confidence = _carried(encoding.frame, followed, K)
+        return self._map.add(encoding, K, points, confidence, followed.T_world_cam)
+
+    def _add(self, encoding: FrameEncoding, prediction: WindowPrediction, view: int,
+             T_world_kf: Tensor) -> Keyframe:
+        points = camera.unproject(prediction.depth[view], prediction.K[view])
+        return self._map.add(encoding, prediction.K[view], points, prediction.confidence[view],
+                             T_world_kf)
+
+    def fuse(self, estimate: WindowEstimate) -> None:
+        """Average the window's new depths into its keyframes, each in its own unit."""
+        for view, keyframe in enumerate(estimate.keyframes, 1):
+            if estimate.prediction.seen_share(view) < self._config.min_confident:
+                continue
+            keyframe = self._map[keyframe.keyframe_id]
+            unit = unit_of(keyframe, estimate.prediction, view)
+            if unit.count and unit.spread < self._config.max_fuse_spread:
+                self._map.fuse(fused(keyframe, estimate.prediction, view, unit.scale))
+
+    def event(self, keyframe: Keyframe, neighbours: Sequence[int]) -> KeyframeEvent:
+        """What loop closure is told, with an edge to each neighbour."""
+        edges = tuple(_edge(self._map[i], keyframe) for i in neighbours
+                      if i != keyframe.keyframe_id)
+        return KeyframeEvent(
+            keyframe.keyframe_id, keyframe.piece_id, keyframe.stamp_ns, keyframe.frame.image,
+            keyframe.K, keyframe.points_cam, keyframe.confidence, keyframe.T_world_kf,
+            keyframe.encoding.descriptor, edges, self._map.take_moved(keyframe.keyframe_id))
+
+
+def _edge(older: Keyframe, newer: Keyframe) -> PoseEdge:
+    depth = float(older.points_cam[::8, ::8, 2].median())
+    sigma = torch.tensor(_EDGE_SIGMA, dtype=torch.float64)
+    sigma[:3] *= depth
+    return PoseEdge(older.keyframe_id, newer.keyframe_id,
+                    sim3.inverse(older.T_world_kf) @ newer.T_world_kf, sigma)
+
+
+def _carried(frame: Frame, followed: Followed, K: Tensor) -> tuple[Tensor, Tensor]:
+    """Pointmap [H,W,3] and confidence [H,W] from sparse points, linear between them."""
+    T_cam_world = sim3.inverse(followed.T_world_cam)
+    z = sim3.transform(T_cam_world, torch.from_numpy(followed.points_world))[:, 2].numpy()
+    front = z > 0
+    uv, rho = followed.uv[front].astype(np.float64), 1.0 / z[front]
+    step = 4
+    v, u = np.mgrid[0:frame.height:step, 0:frame.width:step]
+    coarse = LinearNDInterpolator(uv, rho)(u, v)
+    outside = np.isnan(coarse)
+    coarse[outside] = NearestNDInterpolator(uv, rho)(u[outside], v[outside])
+    grid = torch.nn.functional.interpolate(
+        torch.from_numpy(coarse)[None, None].float(), (frame.height, frame.width),
+        mode='bilinear')[0, 0]
+    confidence = torch.full(grid.shape, _BETWEEN)
+    at = np.rint(uv).astype(np.int64)
+    confidence[at[:, 1], at[:, 0]] = _CARRIED
+    confidence = torch.nn.functional.max_pool2d(confidence[None, None], 5, 1, 2)[0, 0]
+    return camera.unproject(1.0 / grid, K), confidence
+

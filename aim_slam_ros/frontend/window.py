@@ -1,0 +1,85 @@
+"""SIGMA, inference and tracking of one image: the paper's loop around the model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Sequence
+
+from torch import Tensor
+
+from ..config import SigmaConfig
+from ..models.base import GeometryModel
+from ..types import Frame, FrameEncoding, Keyframe, WindowPrediction
+from .keyframe_map import KeyframeMap
+from .sigma import activate, rerank
+from .stages import Stopwatch
+from .tracking import Tracker, TrackingResult, TrackingWindow
+
+
+@dataclass(frozen=True)
+class WindowEstimate:
+    """One inference over a window and the pose it led to."""
+
+    keyframes: tuple[Keyframe, ...]
+    prediction: WindowPrediction
+    result: TrackingResult
+
+    @property
+    def ok(self) -> bool:
+        return self.result.ok
+
+    @property
+    def kappa(self) -> float:
+        return self.result.kappa
+
+
+class WindowTracker:
+    """Prioritises keyframes, infers, tracks, and adds keyframes while that helps.
+
+    The only place that asks the model, so that every inference is counted.
+    """
+
+    def __init__(self, config: SigmaConfig, model: GeometryModel, tracker: Tracker) -> None:
+        self._config = config
+        self._model = model
+        self._tracker = tracker
+        self.inferences = 0
+        self.rotation_only_inferences = 0
+
+    @property
+    def min_views(self) -> int:
+        return self._model.min_views
+
+    def encode(self, frame: Frame, clock: Stopwatch) -> FrameEncoding:
+        with clock.stage('encode'):
+            return self._model.encode(frame)
+
+    def infer(self, encodings: Sequence[FrameEncoding], clock: Stopwatch) -> WindowPrediction:
+        """One inference, counted and timed."""
+        with clock.stage('infer'):
+            prediction = self._model.infer(encodings)
+        self.inferences += 1
+        self.rotation_only_inferences += prediction.rotation_only
+        return prediction
+
+    def track(self, encoding: FrameEncoding, guess: Tensor | None, reference_id: int,
+              keyframes: KeyframeMap, clock: Stopwatch) -> WindowEstimate:
+        """The window is chosen around the reference keyframe (paper: the last keyframe)."""
+        with clock.stage('prioritise'):
+            reference = keyframes[reference_id]
+            ranked = rerank(reference, keyframes.overlapping(reference_id), self._config)
+        return activate(
+            reference_id, [r.keyframe_id for r in ranked],
+            lambda ids: self.estimate(encoding, guess, [keyframes[i] for i in ids], clock),
+            lambda _, ids: [r.keyframe_id for r in rerank(
+                reference, [keyframes[i] for i in ids], self._config)],
+            self._config).attempt
+
+    def estimate(self, encoding: FrameEncoding, guess: Tensor | None,
+                 keyframes: Sequence[Keyframe], clock: Stopwatch) -> WindowEstimate:
+        """One inference over the image and these keyframes, and its pose."""
+        prediction = self.infer([encoding, *(k.encoding for k in keyframes)], clock)
+        with clock.stage('track'):
+            result = self._tracker.track(
+                TrackingWindow(encoding.frame, prediction, tuple(keyframes), guess))
+        return WindowEstimate(tuple(keyframes), prediction, result)

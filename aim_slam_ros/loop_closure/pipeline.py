@@ -1,0 +1,142 @@
+"""Loop closure as in the paper: retrieve, verify, add edges, optimise."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Mapping
+
+from torch import Tensor
+
+from ..config import Config
+from ..geometry import sim3
+from ..models.base import GeometryModel
+from ..types import Cloud, CorrectedKeyframes, KeyframeEvent, KeyframePose, PoseEdge
+from .fused_map import FusedMap
+from .pose_graph import PoseGraph
+from .retrieval import Candidate, Retrieval
+from .verification import LoopVerifier
+
+
+@dataclass(frozen=True)
+class AcceptedLoop:
+    """A verified loop.
+
+    T_older_newer: [4,4] float64 Sim(3) between the keyframes' pointmaps. sigma: [7], as PoseEdge
+    has it. matched_fraction, kappa: as Verification has them.
+    """
+
+    newer: int
+    older: int
+    T_older_newer: Tensor
+    sigma: Tensor
+    matched_fraction: float
+    kappa: float
+
+
+class LoopClosurePipeline:
+    """Takes keyframe events, gives corrected keyframes and the fused map."""
+
+    def __init__(self, config: Config, model: GeometryModel) -> None:
+        self._config = config.loop_closure
+        self._retrieval = Retrieval(self._config)
+        self._verifier = LoopVerifier(self._config, model)
+        self._graph = PoseGraph(self._config.cauchy_width)
+        self._map = FusedMap(self._config)
+        self._events: dict[int, KeyframeEvent] = {}
+        self._waiting: list[PoseEdge] = []
+        self._loops: list[AcceptedLoop] = []
+        self._rejected: Counter[str] = Counter()
+        self._version = 0
+
+    def add(self, event: KeyframeEvent) -> CorrectedKeyframes | None:
+        """Take a keyframe in; all corrected poses if it closed a loop, else None.
+
+        A keyframe that is known already (the frontend was asked to resend) changes nothing.
+        Raises PoseGraphError or RetrievalError for an event with unusable numbers.
+        """
+        if event.keyframe_id in self._graph:
+            return None
+        self._insert(event)
+        if not self._config.enabled:
+            return None
+        candidates = self._retrieve(event)
+        loops = [loop for c in candidates if (loop := self._verify(event, c)) is not None]
+        if not loops:
+            return None
+        self._close(loops)
+        return self._optimise()
+
+    @property
+    def loops(self) -> tuple[AcceptedLoop, ...]:
+        """In the order they were accepted."""
+        return tuple(self._loops)
+
+    @property
+    def rejected(self) -> Mapping[str, int]:
+        """How many candidates failed their verification, by reason."""
+        return dict(self._rejected)
+
+    @property
+    def poses(self) -> tuple[KeyframePose, ...]:
+        """Every keyframe in the corrected world."""
+        return tuple(KeyframePose(k, T) for k, T in self._graph.poses().items())
+
+    def fused_map(self) -> Cloud:
+        """The corrected world's cloud, in the world's unit."""
+        return self._map.fuse(self._graph.poses())
+
+    def _insert(self, event: KeyframeEvent) -> None:
+        # Once the graph has been corrected, its world is not the one the frontend was in when it
+        # made this event; the measured edges hold in both.
+        chained = self._graph.chained(event.keyframe_id, event.edges) if self._version else None
+        T_world_kf = event.T_world_kf if chained is None else chained
+        self._graph.add_keyframe(event.keyframe_id, T_world_kf)
+        self._add_edges(event)
+        T_graph_frontend = T_world_kf @ sim3.inverse(event.T_world_kf)
+        for moved in event.moved:
+            if moved.keyframe_id in self._graph:
+                self._graph.move(moved.keyframe_id, T_graph_frontend @ moved.T_world_kf)
+        self._map.add(event)
+
+    def _add_edges(self, event: KeyframeEvent) -> None:
+        """Edges to keyframes that have not arrived (lost or late messages) wait for them."""
+        edges, self._waiting = [*self._waiting, *event.edges], []
+        for edge in edges:
+            if edge.a in self._graph and edge.b in self._graph:
+                self._graph.add_edge(edge, robust=False)
+            else:
+                self._waiting.append(edge)
+
+    def _retrieve(self, event: KeyframeEvent) -> tuple[Candidate, ...]:
+        self._events[event.keyframe_id] = event
+        self._retrieval.add(event.keyframe_id, event.descriptor)
+        return self._retrieval.candidates(event.keyframe_id, self._graph.neighbourhood(
+            event.keyframe_id, self._config.covisible_hops, self._config.min_gap))
+
+    def _verify(self, newer: KeyframeEvent, candidate: Candidate) -> AcceptedLoop | None:
+        older = self._events[candidate.keyframe_id]
+        found = self._verifier.verify(newer, older, self._companions(newer, older))
+        if not found.accepted:
+            self._rejected[found.reason] += 1
+            return None
+        return AcceptedLoop(newer.keyframe_id, older.keyframe_id, found.T_older_newer,
+                            found.sigma, found.matched_fraction, found.kappa)
+
+    def _companions(self, newer: KeyframeEvent, older: KeyframeEvent) -> list[KeyframeEvent]:
+        """The best neighbour of each, for parallax in the model's window."""
+        ids = [*self._graph.neighbours(older.keyframe_id)[:1],
+               *self._graph.neighbours(newer.keyframe_id)[:1]]
+        pair = (newer.keyframe_id, older.keyframe_id)
+        return [self._events[k] for k in dict.fromkeys(ids) if k not in pair]
+
+    def _close(self, loops: list[AcceptedLoop]) -> None:
+        for loop in loops:
+            edge = PoseEdge(loop.older, loop.newer, loop.T_older_newer, loop.sigma)
+            self._graph.add_edge(edge, robust=True)
+        self._loops += loops
+
+    def _optimise(self) -> CorrectedKeyframes:
+        self._graph.optimise()
+        self._version += 1
+        return CorrectedKeyframes(self._version, self.poses)

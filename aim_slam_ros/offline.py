@@ -1,0 +1,108 @@
+"""Both pipelines over a recorded sequence, in a fixed order and without ROS, so it repeats."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from contextlib import contextmanager
+from typing import Callable, Iterator, Sequence as Indices
+
+import cv2
+import numpy as np
+import torch
+
+from aim_slam_ros.config import Config
+from aim_slam_ros.datasets.base import ImageError, Sequence
+from aim_slam_ros.evaluation.run_result import (LoopPair, PlacedKeyframe, RunResult,
+                                                UnreadableImage)
+from aim_slam_ros.frontend.pipeline import FrontendPipeline
+from aim_slam_ros.loop_closure.pipeline import LoopClosurePipeline
+from aim_slam_ros.models import make_model
+from aim_slam_ros.types import FrameResult
+
+Progress = Callable[[FrameResult | None], None]
+
+
+def run(sequence: Sequence, config: Config, indices: Indices[int],
+        progress: Progress = lambda result: None) -> RunResult:
+    """Process these images of the sequence, every one of them.
+
+    progress: called after each image, with None for an unreadable one. Ctrl-C ends the run: what
+    was gathered until then is returned, marked as interrupted.
+    """
+    _seed(config.seed)
+    return _Run(sequence, config).over(indices, progress)
+
+
+def _seed(seed: int) -> None:
+    torch.manual_seed(seed)
+    np.random.seed(seed)
+    cv2.setRNGSeed(seed)
+
+
+class _Run:
+    """The state of one run."""
+
+    def __init__(self, sequence: Sequence, config: Config) -> None:
+        model = make_model(config)
+        self._sequence = sequence
+        self._frontend = FrontendPipeline(config, model)
+        self._loop_closure = LoopClosurePipeline(config, model)
+        self._results: list[FrameResult] = []
+        self._unreadable: list[UnreadableImage] = []
+        self._stage_s: defaultdict[str, float] = defaultdict(float)
+
+    def over(self, indices: Indices[int], progress: Progress) -> RunResult:
+        """Every image in turn, then what came out."""
+        interrupted = False
+        start = time.perf_counter()
+        try:
+            for index in indices:
+                progress(self._step(index))
+        except KeyboardInterrupt:
+            interrupted = True
+        return self._result(time.perf_counter() - start, interrupted)
+
+    def _step(self, index: int) -> FrameResult | None:
+        """Read, track, close loops, correct."""
+        image = self._read(index)
+        if image is None:
+            return None
+        result = self._frontend.process(int(self._sequence.stamps_ns[index]), image,
+                                        self._sequence.K)
+        self._results.append(result)
+        for stage, seconds in result.stage_s.items():
+            self._stage_s[stage] += seconds
+        for event in result.events:
+            with self._timed('loop_closure'):
+                correction = self._loop_closure.add(event)
+            if correction is not None:
+                with self._timed('correct'):
+                    self._frontend.apply_correction(correction)
+        return result
+
+    def _read(self, index: int) -> np.ndarray | None:
+        with self._timed('read'):
+            try:
+                return self._sequence.image(index)
+            except ImageError as error:
+                self._unreadable.append(UnreadableImage(str(error.path), error.reason))
+                return None
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self._stage_s[stage] += time.perf_counter() - start
+
+    def _result(self, wall_s: float, interrupted: bool) -> RunResult:
+        return RunResult(
+            results=tuple(self._results), unreadable=tuple(self._unreadable),
+            offered=len(self._results) + len(self._unreadable), wall_s=wall_s,
+            stage_s=dict(self._stage_s),
+            keyframes=tuple(PlacedKeyframe(k.keyframe_id, k.piece_id, k.stamp_ns, k.T_world_kf)
+                            for k in self._frontend.keyframes),
+            loops=tuple(LoopPair(loop.newer, loop.older) for loop in self._loop_closure.loops),
+            map_cloud=self._loop_closure.fused_map(),
+            rotation_only_inferences=self._frontend.rotation_only_inferences,
+            interrupted=interrupted)
