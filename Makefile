@@ -23,8 +23,7 @@ test: $(READY)
 	@$(BIN)/python -m pytest
 
 lint: $(READY)
-	@$(BIN)/python -m flake8
-	@$(BIN)/python -m mypy
+	@status=0; $(BIN)/python -m flake8 || status=1; $(BIN)/python -m mypy || status=1; exit $$status
 
 clean:
 	@rm -rf $(VENV) .pytest_cache .mypy_cache

@@ -126,7 +126,8 @@ class SigmaConfig(_Section):
         4, 'every so many pixels of a keyframe are indexed and ranked', 1, 64)
     candidates: int = _setting(10, 'keyframes kept by voxel overlap for the ranking', 1, 100)
     points: int = _setting(
-        2000, 'least confident points of the last keyframe that the gain is computed on', 10, 100000)
+        2000, 'least confident points of the last keyframe that the gain is computed on', 10,
+        100000)
     sigma_px: float = _setting(1.0, 'noise of a pixel [px]', 0.01, 100)
     sigma_depth: float = _setting(
         0.05, 'relative noise of the depth at the median confidence', 1e-4, 1)
@@ -177,11 +178,12 @@ class LoopClosureConfig(_Section):
     covisible_hops: int = _setting(
         2, 'keyframes within this many edges are no candidates', 0, 10)
     similarity: float = _setting(
-        0.8, "a candidate's similarity relative to the previous keyframe's", 0, 1)
+        0.5, "least similarity of a candidate: 0 is the median over all keyframes, 1 the best of "
+        "the keyframe's neighbours", 0, 1)
     min_matched: float = _setting(
-        0.15, "fraction of a keyframe's confident points that must be found in the other, in both "
-        'directions', 0, 1)
-    max_kappa: float = _setting(4.0, 'largest reduced chi-square of a verified loop', 0.1, 1000)
+        0.15, "fraction of a keyframe's textured points around which the other must look the same, "
+        'in both directions', 0, 1)
+    max_kappa: float = _setting(2.0, 'largest reduced chi-square of a verified loop', 0.1, 1000)
     max_disagreement: float = _setting(
         0.08, 'largest difference between the two directions of a loop, relative to the median '
         'depth for translations and natural (rad, log-scale) for the rest', 0.001, 1)
@@ -197,7 +199,7 @@ class LoopClosureConfig(_Section):
 
 @dataclass(frozen=True)
 class FollowingConfig(_Section):
-    points: int = _setting(400, 'corners of a keyframe that are followed', 50, 5000)
+    points: int = _setting(250, 'corners of a keyframe that are followed', 50, 5000)
     spacing_px: int = _setting(9, 'smallest distance between two of them [px]', 2, 50)
     references: int = _setting(3, 'keyframes an image is followed against', 1, 10)
     sigma_px: float = _setting(0.6, 'standard deviation of a followed point [px]', 0.05, 10)
@@ -214,7 +216,7 @@ class TrackingConfig(_Section):
     tracker: str = _setting(
         'image', "refine matches in the images, or the paper's joint Sim(3) solve",
         choices=('image', 'paper'))
-    stride: int = _setting(6, 'every so many pixels of a keyframe are matched [px]', 1, 64)
+    stride: int = _setting(12, 'every so many pixels of a keyframe are matched [px]', 1, 64)
     sigma_px: float = _setting(
         1.0, 'standard deviation of a refined match [px]; calibrates kappa', 0.05, 10)
     min_matches: int = _setting(60, 'fewer refined matches than this: keep the pose mean',
@@ -242,7 +244,7 @@ class KeyframesConfig(_Section):
 @dataclass(frozen=True)
 class InitialisationConfig(_Section):
     min_parallax_px: float = _setting(
-        8.0, 'parallax awaited by a model that needs two views [px at a width of 518]', 0.5, 200)
+        6.0, 'parallax awaited by a model that needs two views [px at a width of 518]', 0.5, 200)
     max_frames: int = _setting(
         60, 'after so many images the map is begun without parallax', 2, 10000)
 

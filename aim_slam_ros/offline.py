@@ -21,6 +21,7 @@ from aim_slam_ros.models import make_model
 from aim_slam_ros.types import FrameResult
 
 Progress = Callable[[FrameResult | None], None]
+_LAST = ('loop_closure', 'correct')    # stages that follow those of the frontend
 
 
 def run(sequence: Sequence, config: Config, indices: Indices[int],
@@ -99,7 +100,7 @@ class _Run:
         return RunResult(
             results=tuple(self._results), unreadable=tuple(self._unreadable),
             offered=len(self._results) + len(self._unreadable), wall_s=wall_s,
-            stage_s=dict(self._stage_s),
+            stage_s=dict(sorted(self._stage_s.items(), key=lambda item: item[0] in _LAST)),
             keyframes=tuple(PlacedKeyframe(k.keyframe_id, k.piece_id, k.stamp_ns, k.T_world_kf)
                             for k in self._frontend.keyframes),
             loops=tuple(LoopPair(loop.newer, loop.older) for loop in self._loop_closure.loops),

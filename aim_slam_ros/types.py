@@ -179,8 +179,9 @@ class FrameResult:
     T_world_cam: [4,4] float64, rigid, in the frontend's world; None unless TRACKED.
     reference_id, T_kf_cam: the keyframe it was tracked against and the pose in its frame (in the
     keyframe's unit, rigid): what survives a later correction of the keyframe.
-    event: set when this image became a keyframe. window: keyframe ids of the inference, if any.
+    events: the keyframes that this image led to. window: keyframe ids of the inference, if any.
     kappa: reduced chi-square of its optimisation. stage_s: seconds spent in each stage.
+    late: images that waited for the map to begin and were placed in it now, oldest first.
     reason: why it was skipped or lost, for a person.
     """
 
@@ -196,6 +197,7 @@ class FrameResult:
     inferences: int = 0
     matched_fraction: float = 0.0
     stage_s: Mapping[str, float] = field(default_factory=dict)
+    late: tuple[FrameResult, ...] = ()
     reason: str = ''
 
 

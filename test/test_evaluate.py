@@ -184,7 +184,9 @@ def test_ctrl_c_writes_what_there_is(room: Path, tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, '-m', 'aim_slam_ros.cli.evaluate', str(room), '--out', str(tmp_path),
          *QUICK], cwd=ROOT, env=os.environ | {'PYTHONPATH': str(ROOT)}, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        # a shell starts background jobs, and so this test, with SIGINT ignored
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
     assert process.stderr is not None
     for line in process.stderr:
         if 'images, ' in line:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from aim_slam_ros.evaluation.trajectory import (Incomparable, TrajectoryError, compare, length,
-                                                tolerance_s)
+from aim_slam_ros.evaluation.trajectory import (Incomparable, TrajectoryError, compare, during,
+                                                length, tolerance_s)
 from aim_slam_ros.geometry import sim3
 from aim_slam_ros.types import StampedPoses
 
@@ -106,3 +106,10 @@ def test_length() -> None:
     """A helix of radius 1 and pitch .2 over 4 rad; chords of 4/999 rad are 1e-6 too short."""
     assert length(helix(1000)) == pytest.approx(4 * np.hypot(1, 0.2), rel=1e-5)
     assert length(helix(1)) == 0.0
+
+
+def test_a_time_span_includes_its_ends() -> None:
+    truth = helix()
+    part = during(truth, int(truth.stamps_ns[3]), int(truth.stamps_ns[7]))
+    assert part.stamps_ns.tolist() == truth.stamps_ns[3:8].tolist()
+    np.testing.assert_array_equal(part.T_world_cam, truth.T_world_cam[3:8])

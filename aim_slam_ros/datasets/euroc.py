@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,8 +45,10 @@ class EurocSequence(Sequence):
         """Raises DatasetError."""
         listed = read_stamped_list(cam0 / 'data.csv', 'timestamp [ns],filename', 2, ',', int)
         sensor = _read_sensor(cam0 / 'sensor.yaml')
-        truth = cam0.resolve().parent / _GROUNDTRUTH / 'data.csv'
-        super().__init__(_name(cam0.resolve()), listed.stamps_ns, sensor.calibration,
+        # Not resolve(): a linked cam0 still has its ground truth beside the link.
+        whole = Path(os.path.abspath(cam0))
+        truth = whole.parent / _GROUNDTRUTH / 'data.csv'
+        super().__init__(_name(whole), listed.stamps_ns, sensor.calibration,
                          _read_groundtruth(truth, cam0, sensor) if truth.exists() else None,
                          listed.dropped_stamps, listed.unreadable_lines)
         self._files = [cam0 / 'data' / value[0] for value in listed.values]

@@ -7,6 +7,7 @@ from pathlib import Path
 from aim_slam_ros.datasets.base import DatasetError, Sequence
 from aim_slam_ros.datasets.euroc import EurocSequence, find_cam0
 from aim_slam_ros.datasets.folder import FolderSequence, list_images
+from aim_slam_ros.datasets.images import SUFFIXES
 from aim_slam_ros.datasets.rendered import PREFIX, load_rendered
 from aim_slam_ros.datasets.tum import TumSequence
 from aim_slam_ros.datasets.undistort import undistorted
@@ -33,6 +34,8 @@ def load_sequence(source: str | Path, *, undistort: bool = False,
 def _open(path: Path) -> Sequence:
     if not path.exists():
         raise DatasetError(path, 'does not exist', 'check the path')
+    if path.suffix.lower() in SUFFIXES and not path.is_dir():
+        raise DatasetError(path, 'is a single image', 'name the folder that holds the images')
     if not path.is_dir():
         return VideoSequence(path)
     if (path / 'rgb.txt').exists():

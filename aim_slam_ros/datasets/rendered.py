@@ -41,6 +41,8 @@ _FOCAL_PX = 525.0
 _NOISE = 2.0
 _EXPOSURE = 0.03
 _JPEG_QUALITY = 95
+# Each holds about 150 MB while it works.
+_MAX_WORKERS = 8
 
 Progress = Callable[[int], object]
 
@@ -58,9 +60,7 @@ class _Camera:
 def load_rendered(source: str, cache_dir: Path | None) -> Sequence:
     """The scene from the cache, rendered first where it is not there; raises DatasetError."""
     name, seed = _parsed(source)
-    root = cache_dir or Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache')
-    root = root if cache_dir else root / 'aim_slam_ros'
-    folder = root / f'rendered-{_VERSION}-{name}-{seed}'
+    folder = cache_folder(name, seed, cache_dir)
     if not (folder / 'rgb.txt').exists():
         try:
             _fill_cache(name, seed, folder)
@@ -70,6 +70,14 @@ def load_rendered(source: str, cache_dir: Path | None) -> Sequence:
     sequence = TumSequence(folder)
     sequence.name = f'rendered_{name}' + (f'_{seed}' if seed else '')
     return sequence
+
+
+def cache_folder(name: str, seed: int, cache_dir: Path | None = None) -> Path:
+    """Where a scene is kept; by default in the user's cache (XDG_CACHE_HOME or ~/.cache)."""
+    if cache_dir is None:
+        user = os.environ.get('XDG_CACHE_HOME') or '~/.cache'
+        cache_dir = Path(user).expanduser() / 'aim_slam_ros'
+    return cache_dir / f'rendered-{_VERSION}-{name}-{seed}'
 
 
 def render(name: str, out: Path, *, seed: int = 0, frames: slice = slice(None),
@@ -85,7 +93,7 @@ def render(name: str, out: Path, *, seed: int = 0, frames: slice = slice(None),
     taken = _camera(scene, seed, size)
     for kind in ('rgb', 'depth'):
         (out / kind).mkdir(parents=True)
-    workers = len(os.sched_getaffinity(0))
+    workers = min(os.cpu_count() or 1, _MAX_WORKERS)
     with ThreadPoolExecutor(workers) as pool:
         # In small batches, so that an interrupt does not wait for all of them.
         for start in range(0, len(chosen), workers):

@@ -52,15 +52,17 @@ def noise(surface: Surface, coarsest_m: float = 0.4, stretch: float = 1.0,
     that of the one before.
     """
     h, w = surface.shape
-    out, weight, power = np.zeros((h, w), np.float32), 1.0, 0.0
+    out, weight, power = np.zeros((2, 2), np.float32), 1.0, 0.0
     wavelength = coarsest_m
     while wavelength >= max(2.0 * surface.texel_m, finest_m):
         cells = (math.ceil(surface.height_m / wavelength) + 2,
                  math.ceil(surface.width_m / (wavelength * stretch)) + 2)
-        field = surface.rng.standard_normal(cells, dtype=np.float32)
-        out += weight * cv2.resize(field, (w, h), interpolation=cv2.INTER_CUBIC)
+        # What is coarse so far stays small until a finer octave is added to it.
+        out = cv2.resize(out, cells[::-1], interpolation=cv2.INTER_CUBIC)
+        out += weight * surface.rng.standard_normal(cells, dtype=np.float32)
         power += weight**2
         wavelength, weight = wavelength / 2.0, weight * roughness
+    out = cv2.resize(out, (w, h), interpolation=cv2.INTER_CUBIC)
     return out / np.float32(0.7 * math.sqrt(max(power, 1e-9)))
 
 

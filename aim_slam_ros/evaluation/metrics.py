@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Mapping, Sequence
 
 from aim_slam_ros.evaluation.run_result import RunResult
-from aim_slam_ros.evaluation.trajectory import Incomparable, TrajectoryError, compare, length
+from aim_slam_ros.evaluation.trajectory import (Incomparable, TrajectoryError, compare, during,
+                                                length)
 from aim_slam_ros.types import StampedPoses, TrackingStatus
 
 Metric = float | int | str | bool | None
@@ -27,7 +28,7 @@ def compute(run: RunResult, groundtruth: StampedPoses | None,
         'ate_rmse_causal_m': causal,
         **_counts(run),
         **_rates(run),
-        'trajectory_length_m': length(groundtruth) if groundtruth else None,
+        'trajectory_length_m': _true_length(run, groundtruth),
         'interrupted': run.interrupted,
         **{f'stage_{name}_ms_per_frame': _ratio(1e3 * seconds, run.offered)
            for name, seconds in run.stage_s.items()},
@@ -42,7 +43,10 @@ def write(path: Path, metrics: Mapping[str, Metric]) -> None:
 
 
 def _counts(run: RunResult) -> dict[str, Metric]:
-    """A frame is tracked only when its pose belongs to the largest connected map."""
+    """A frame is tracked only when its pose belongs to the largest connected map.
+
+    mean_window counts views: the keyframes of an inference and the current frame.
+    """
     tracked = len(run.tracked)
     return {
         'frames_offered': run.offered,
@@ -58,7 +62,7 @@ def _counts(run: RunResult) -> dict[str, Metric]:
         'loops': len(run.loops),
         'inferences': sum(result.inferences for result in run.results),
         'rotation_only_inferences': run.rotation_only_inferences,
-        'mean_window': _mean([len(r.window) for r in run.results if r.window]),
+        'mean_window': _mean([len(r.window) + 1 for r in run.results if r.window]),
         'mean_kappa': _mean([r.kappa for r in run.results
                              if r.kappa is not None and math.isfinite(r.kappa)]),
     }
@@ -70,6 +74,13 @@ def _rates(run: RunResult) -> dict[str, Metric]:
     return {'wall_s': run.wall_s,
             'rate_hz': _ratio(run.offered, run.wall_s),
             'rate_without_model_hz': _ratio(run.offered, run.wall_s - model_s)}
+
+
+def _true_length(run: RunResult, groundtruth: StampedPoses | None) -> float | None:
+    """How far the camera really moved while the images were taken."""
+    if groundtruth is None or not run.results:
+        return None
+    return length(during(groundtruth, run.results[0].stamp_ns, run.results[-1].stamp_ns))
 
 
 def _rmse(error: TrajectoryError | Incomparable) -> float | None:

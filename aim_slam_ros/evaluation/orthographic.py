@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from aim_slam_ros.types import Cloud
 
 _LONG_SIDE_PX = 640
 _MAX_POINTS = 600_000
+_MAX_PAINTED_PX = 8_000_000
 _OUTLIERS = (1.0, 99.0)   # percentiles between which the drawn box lies
 
 
@@ -51,7 +53,9 @@ def _paint(cloud: Cloud, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     column, from_bottom = ((cloud.points[:, :2] - low) / pixel).astype(int).T
     row = height - 1 - from_bottom
     far_to_near = np.argsort(-cloud.points[:, 2], kind='stable')
-    offsets = np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), -1).reshape(1, -1, 2)
+    radius = _radius_px(cloud.points, pixel)
+    steps = np.arange(-radius, radius + 1)
+    offsets = np.stack(np.meshgrid(steps, steps), -1).reshape(1, -1, 2)
     rows = np.clip(row[far_to_near, None] + offsets[..., 0], 0, height - 1)
     columns = np.clip(column[far_to_near, None] + offsets[..., 1], 0, width - 1)
     image = np.zeros((height, width, 4), np.uint8)
@@ -60,6 +64,16 @@ def _paint(cloud: Cloud, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         cloud.colours[far_to_near], offsets.shape[1], axis=0)
     image[rows.ravel(), columns.ravel(), 3] = 255
     return image
+
+
+def _radius_px(points: np.ndarray, pixel: float) -> int:
+    """Half the side of a point's square, large enough that a surface closes."""
+    if len(points) < 2:
+        return 1
+    sample = points[::max(len(points) // 2000, 1)]
+    spacing = float(np.median(cKDTree(points).query(sample, k=2)[0][:, 1]))
+    affordable = int((np.sqrt(_MAX_PAINTED_PX / len(points)) - 1) / 2)
+    return int(np.clip(np.ceil(0.6 * spacing / pixel), 1, max(min(5, affordable), 1)))
 
 
 def _thinned(cloud: Cloud) -> Cloud:

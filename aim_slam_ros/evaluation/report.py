@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 from aim_slam_ros.evaluation import orthographic
-from aim_slam_ros.evaluation.trajectory import Incomparable, TrajectoryError
+from aim_slam_ros.evaluation.trajectory import Incomparable, TrajectoryError, during
 from aim_slam_ros.evaluation.viewpoint import view_axes
 from aim_slam_ros.types import Cloud, FrameResult, StampedPoses, TrackingStatus
 
@@ -103,9 +103,8 @@ class _Scene:
         poses, results = self._data.groundtruth, self._data.results
         if poses is None or not self.metric or not results:
             return None
-        during = (poses.stamps_ns >= results[0].stamp_ns) & \
-            (poses.stamps_ns <= results[-1].stamp_ns)
-        return poses.T_world_cam[during, :3, 3] @ self._axes.T
+        seen = during(poses, results[0].stamp_ns, results[-1].stamp_ns)
+        return seen.T_world_cam[:, :3, 3] @ self._axes.T
 
     @cached_property
     def cloud(self) -> Cloud:

@@ -75,6 +75,12 @@ def tolerance_s(groundtruth: StampedPoses) -> float:
     return min(_MAX_DIFF_S, max(_MIN_DIFF_S, spacing / 2.0))
 
 
+def during(poses: StampedPoses, first_ns: int, last_ns: int) -> StampedPoses:
+    """The poses of a time span, both ends included."""
+    inside = (poses.stamps_ns >= first_ns) & (poses.stamps_ns <= last_ns)
+    return StampedPoses(poses.stamps_ns[inside], poses.T_world_cam[inside])
+
+
 def length(poses: StampedPoses) -> float:
     """Arc length, in the poses' unit."""
     positions = poses.T_world_cam[:, :3, 3]

@@ -11,14 +11,15 @@ from torch import Tensor
 
 from ..config import FollowingConfig
 from ..geometry import camera, sim3
-from ..registration.flow import LEVELS, refine
+from ..registration.flow import LEVELS, TIGHT_LEVELS, refine
 from ..registration.rigid import RigidSolution, solve_rigid, solve_rigid_from_scratch
 from ..types import Keyframe
 from .landmarks import LandmarkCache
 
 _SEARCH_PX = 90.0      # how far a point may be from a prediction by motion alone
-_SETTLED_PX = 3.0      # a smaller correction of the prediction needs no second look
-_TIGHT_PX = 10.0
+_SEARCH_POINTS = 60    # strongest corners per reference that are searched that far
+_SEARCH_MIN = 12       # found points below which the search says nothing
+_TIGHT_PX = 12.0       # and from the prediction by the pose that they gave
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,6 @@ class _Found:
     points_world: np.ndarray
     spread_world: np.ndarray
     uv: np.ndarray
-    move_px: float
 
 
 class Follower:
@@ -59,39 +59,43 @@ class Follower:
     def follow(self, grey: np.ndarray, K: Tensor, T_world_cam_guess: Tensor,
                references: Sequence[Keyframe]) -> Followed:
         """references: the one that counts for matched_fraction first. K: [3,3] of the image."""
-        found = self._find(grey, K, T_world_cam_guess, references, _SEARCH_PX, LEVELS)
-        solution = self._solve(found, K, T_world_cam_guess)
-        if solution is not None and found.move_px > _SETTLED_PX:
-            T_world_cam = sim3.inverse(solution.T_cam_ref)
-            found = self._find(grey, K, T_world_cam, references, _TIGHT_PX, 1)
-            solution = self._solve(found, K, T_world_cam)
+        first = self._find(grey, K, T_world_cam_guess, references, wide=True)
+        solution = self._solve(first, K, T_world_cam_guess, _SEARCH_MIN)
+        T_world_cam = T_world_cam_guess if solution is None else \
+            sim3.inverse(solution.T_cam_ref)
+        found = self._find(grey, K, T_world_cam, references, wide=False)
+        solution = self._solve(found, K, T_world_cam, self._config.min_inliers)
         return self._followed(found, solution, T_world_cam_guess, references)
 
     def _find(self, grey: np.ndarray, K: Tensor, T_world_cam: Tensor,
-              references: Sequence[Keyframe], reach_px: float, levels: int) -> _Found:
-        owners, points, spreads, pixels, moves = [], [], [], [], []
+              references: Sequence[Keyframe], wide: bool) -> _Found:
+        """Wide: a few points, far around; else all of them, near their predictions."""
+        owners, points, spreads, pixels = [], [], [], []
         T_cam_world = sim3.inverse(T_world_cam)
         for index, keyframe in enumerate(references):
             landmarks = self._landmarks.of(keyframe)
+            if wide:
+                landmarks = landmarks.strongest(_SEARCH_POINTS)
             points_cam = landmarks.points(keyframe)
             sigma = landmarks.relative_sigma(keyframe, self._config.sigma_depth)
             T = keyframe.T_world_kf.numpy()
             world = points_cam @ T[:3, :3].T + T[:3, 3]
             uv = camera.project(sim3.transform(T_cam_world, torch.from_numpy(world)), K).numpy()
-            matches = refine(keyframe.frame.grey, grey, landmarks.uv, uv, reach_px, levels=levels)
+            matches = refine(keyframe.frame.grey, grey, landmarks.uv, uv,
+                             _SEARCH_PX if wide else _TIGHT_PX, None if wide else 0.7,
+                             LEVELS if wide else TIGHT_LEVELS)
             hit = matches.valid
             owners.append(np.full(int(hit.sum()), index))
             points.append(world[hit])
             spreads.append((world[hit] - T[:3, 3]) * sigma[hit, None])
             pixels.append(matches.uv_b[hit])
-            moves.append(np.linalg.norm(matches.uv_b[hit] - uv[hit], axis=1))
-        moved = np.concatenate(moves)
         return _Found(np.concatenate(owners), np.concatenate(points), np.concatenate(spreads),
-                      np.concatenate(pixels), float(np.median(moved)) if moved.size else 0.0)
+                      np.concatenate(pixels))
 
-    def _solve(self, found: _Found, K: Tensor, T_world_cam: Tensor) -> RigidSolution | None:
+    def _solve(self, found: _Found, K: Tensor, T_world_cam: Tensor,
+               at_least: int) -> RigidSolution | None:
         """From the guess, or where that explains too little, from scratch."""
-        if len(found.uv) < self._config.min_inliers:
+        if len(found.uv) < at_least:
             return None
         best = None
         for T_cam_world in (sim3.inverse(T_world_cam), None):

@@ -23,11 +23,13 @@ _PATIENCE = 1.3         # a window that showed no depth is tried again with this
 class Beginning:
     """The first window: encodings and prediction, the current frame first, the oldest second.
 
-    measured: false where the model never saw depth and the map begins on its prior alone.
+    waiting: the frames between these two, oldest first. measured: false where the model never saw
+    depth and the map begins on its prior alone.
     """
 
     encodings: tuple[FrameEncoding, ...]
     prediction: WindowPrediction
+    waiting: tuple[Frame, ...]
     measured: bool
 
 
@@ -106,5 +108,5 @@ class Initialisation:
         encodings = tuple(self._window_tracker.encode(frame, clock) for frame in frames)
         prediction = self._window_tracker.infer(encodings, clock)
         seen = min(prediction.seen_share(view) for view in range(min(2, len(frames))))
-        return Beginning(encodings, prediction,
+        return Beginning(encodings, prediction, tuple(self._frames[1:-1]),
                          seen >= self._min_seen and not prediction.rotation_only)

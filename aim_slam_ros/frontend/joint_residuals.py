@@ -1,4 +1,4 @@
-"""The residuals of all pairs of a window, linearised together (paper, equation of the hybrid residual).
+"""The residuals of all pairs of a window, linearised together (paper, hybrid residual).
 
 All pairs are padded to one length and handled as one batch: with a dozen small operations per
 pair the overhead of each would cost more than its arithmetic.

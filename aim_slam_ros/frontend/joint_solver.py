@@ -104,7 +104,7 @@ class _Descent:
         return links, tried, system.kappa
 
     def _system(self, links: Tensor) -> _System:
-        """Left perturbations of the links move a pair by delta_ij = sum over k Ad(T_i_k) delta_k."""
+        """Perturbed links move a pair by delta_ij = sum over k of Ad(T_i_k) delta_k."""
         chains = [list(itertools.accumulate(links[pair.i:pair.j], torch.matmul,
                                             initial=sim3.identity())) for pair in self._pairs]
         T_i_j = torch.stack([chain[-1] for chain in chains])

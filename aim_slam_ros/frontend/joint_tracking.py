@@ -16,9 +16,9 @@ from torch import Tensor
 
 from ..config import JointTrackingConfig
 from ..geometry import camera, rays, sim3
-from ..registration.scale import log_depth_ratio
-from ..types import Keyframe
+from ..types import GUESSED_CONFIDENCE, Keyframe
 from . import joint_solver
+from .alignment import pose_mean
 from .joint_residuals import PairMatches
 from .tracking import TrackingResult, TrackingWindow
 
@@ -64,9 +64,9 @@ class JointTracker:
             return _failed('there is no keyframe in the window')
         if window.prediction.rotation_only:
             return _failed('the views differ by a rotation alone: their depth is not measured')
-        guess = pose_mean(window)
+        guess = pose_mean(window, self._config.min_match_fraction)
         if guess is None:
-            return _failed('the prediction and the keyframes share no depth')
+            return _failed('the prediction and the keyframes share no depth that was seen')
         order = sorted(range(len(window.keyframes)), key=lambda k: window.keyframes[k].stamp_ns)
         views = [self._keyframe_view(window, k) for k in order]
         views.append(self._current_view(window, guess))
@@ -107,12 +107,13 @@ class JointTracker:
                      self._offered(prediction.confidence[0]), None)
 
     def _offered(self, confidence: Tensor) -> int:
-        return max(1, len(grid_indices(*confidence.shape, self._config.stride)))
+        return max(1, len(grid_indices(confidence, self._config.stride)))
 
     def _grid(self, confidence: Tensor, points: Tensor) -> Tensor:
-        """Flat indices [M] of the grid points that are finite, in front and confident enough."""
-        at = grid_indices(*confidence.shape, self._config.stride).to(confidence.device)
+        """Flat indices [M] of the grid points that were seen, in front and confident enough."""
+        at = grid_indices(confidence, self._config.stride)
         at = at[torch.isfinite(confidence.reshape(-1)[at])
+                & (confidence.reshape(-1)[at] > GUESSED_CONFIDENCE)
                 & (points.reshape(-1, 3)[at, 2] > 0)]
         values = confidence.reshape(-1)[at]
         if len(values) == 0:
@@ -133,10 +134,10 @@ class JointTracker:
         # On one ray, distances are to each other as depths.
         occlusion = torch.log(matches.points_i[:, 2] / X[:, 2]).abs()
         points_i = rays.sample(view_i.points, matches.uv_i)
-        q = (rays.sample(view_i.confidence[..., None], matches.uv_i)[:, 0]
-             * view_j.confidence.reshape(-1)[view_j.at]).sqrt()
+        confidence_i = rays.sample(view_i.confidence[..., None], matches.uv_i)[:, 0]
+        q = (confidence_i * view_j.confidence.reshape(-1)[view_j.at]).sqrt()
         keep = matches.valid & (occlusion < self._config.depth_tolerance)
-        keep &= (points_i[:, 2] > 0) & (q > 0)
+        keep &= (points_i[:, 2] > 0) & (confidence_i > GUESSED_CONFIDENCE)
         if int(keep.sum()) < self._config.min_match_fraction * view_j.offered:
             keep = torch.zeros_like(keep)
         at, q = view_j.at[keep], q[keep]
@@ -152,31 +153,12 @@ class JointTracker:
         return self._config.memory * min(view_i.observations, view_j.observations)
 
 
-def grid_indices(height: int, width: int, stride: int) -> Tensor:
-    """[M] int64: flat indices of every ``stride``-th pixel, both ways."""
-    rows = torch.arange(stride // 2, height, stride)
-    columns = torch.arange(stride // 2, width, stride)
+def grid_indices(image: Tensor, stride: int) -> Tensor:
+    """[M] int64: flat indices of every ``stride``-th pixel, both ways, of an image [H,W]."""
+    height, width = image.shape
+    rows = torch.arange(stride // 2, height, stride, device=image.device)
+    columns = torch.arange(stride // 2, width, stride, device=image.device)
     return (rows[:, None] * width + columns).reshape(-1)
-
-
-def pose_mean(window: TrackingWindow) -> Tensor | None:
-    """The mean over the keyframes of where the model puts the frame: Sim(3) [4,4], or None.
-
-    Each keyframe gives the inference a unit of its own, by the median log depth ratio.
-    """
-    guesses = []
-    for k, keyframe in enumerate(window.keyframes):
-        at = grid_indices(*keyframe.confidence.shape, 8).to(keyframe.confidence.device)
-        ratio = log_depth_ratio(keyframe.points_cam[..., 2].reshape(-1)[at],
-                                window.prediction.depth[k + 1].reshape(-1)[at],
-                                keyframe.confidence.reshape(-1)[at])
-        if ratio.count:
-            unit = sim3.from_parts(ratio.scale, torch.eye(3), torch.zeros(3))
-            guesses.append(keyframe.T_world_kf @ unit
-                           @ sim3.inverse(window.prediction.T_first_cam[k + 1]))
-    if not guesses:
-        return None
-    return sim3.mean(torch.stack(guesses), torch.ones(len(guesses), dtype=torch.float64))
 
 
 def _median_depth(view: _View) -> float:

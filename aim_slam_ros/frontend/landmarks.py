@@ -35,6 +35,10 @@ class Landmarks:
 
     uv: np.ndarray
 
+    def strongest(self, count: int) -> Landmarks:
+        """The corners come in order of strength."""
+        return Landmarks(self.uv[:count])
+
     def points(self, keyframe: Keyframe) -> np.ndarray:
         """[N,3] float64 in the keyframe's unit, from its pointmap as it is now."""
         u, v = self._pixels()

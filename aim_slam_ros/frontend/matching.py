@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..geometry import camera, sim3
-from ..registration.flow import refine
+from ..registration.flow import TIGHT_LEVELS, refine
 from ..types import GUESSED_CONFIDENCE, Keyframe
 from .landmarks import relative_depth_sigma
 
@@ -61,7 +61,7 @@ def _of_one(keyframe: Keyframe, grey: np.ndarray, K: Tensor, T_world_cam: Tensor
     sigma = relative_depth_sigma(confidence[seen], mean, sigma_depth).double()
     world = sim3.transform(keyframe.T_world_kf, points)
     uv = camera.project(sim3.transform(sim3.inverse(T_world_cam), world), K).numpy()
-    found = refine(keyframe.frame.grey, grey, uv_kf, uv)
+    found = refine(keyframe.frame.grey, grey, uv_kf, uv, levels=TIGHT_LEVELS)
     hit = torch.from_numpy(found.valid)
     spread = (world - sim3.translation_of(keyframe.T_world_kf)) * sigma[:, None]
     return (len(uv_kf), world[hit].numpy(), spread[hit].numpy(), found.uv_b[found.valid],

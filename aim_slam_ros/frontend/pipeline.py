@@ -94,8 +94,25 @@ class FrontendPipeline:
                                reason='waiting for parallax')
         keyframes = self._promotion.begin(beginning)
         events = [self._promotion.event(k, [keyframes[0].keyframe_id]) for k in keyframes]
+        self._references.main_id = keyframes[0].keyframe_id
+        late = self._place_waiting(keyframes, beginning, clock)
         self._references.main_id = keyframes[-1].keyframe_id
-        return self._tracked(frame, sim3.rigid_part(keyframes[-1].T_world_kf), events)
+        return replace(self._tracked(frame, sim3.rigid_part(keyframes[-1].T_world_kf), events),
+                       late=late)
+
+    def _place_waiting(self, keyframes: Sequence[Keyframe], beginning: Beginning,
+                       clock: Stopwatch) -> tuple[FrameResult, ...]:
+        """The images that the map had to wait for, followed against it now."""
+        if not beginning.measured:
+            return ()
+        first = keyframes[0].frame
+        late = [self._tracked(first, sim3.rigid_part(keyframes[0].T_world_kf), ())]
+        for frame in beginning.waiting:
+            with clock.stage('follow'):
+                followed = self._follow(frame)
+            if followed.ok:
+                late.append(self._tracked(frame, followed.T_world_cam, ()))
+        return tuple(replace(result, piece_id=self._map.piece_id) for result in late)
 
     def _track(self, frame: Frame, clock: Stopwatch) -> FrameResult:
         """Follow, ask the model where it pays, keep what came of it."""

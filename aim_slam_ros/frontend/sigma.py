@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..config import SigmaConfig
 from ..geometry import camera, rays, sim3
-from ..types import Keyframe
+from ..types import GUESSED_CONFIDENCE, Keyframe
 from .voxel_index import VoxelIndex
 
 
@@ -132,10 +132,11 @@ class _Seen:
 
 
 def _uncertain_points(last: Keyframe, config: SigmaConfig) -> _Uncertain:
-    """The least confident of the finite points of the last keyframe, on the grid."""
+    """The least confident of the points that the last keyframe has seen, on the grid."""
     points = last.points_cam[::config.stride, ::config.stride].reshape(-1, 3).double()
     confidence = last.confidence[::config.stride, ::config.stride].reshape(-1).double()
-    usable = (points[:, 2] > 0) & torch.isfinite(points).all(-1) & torch.isfinite(confidence)
+    usable = (points[:, 2] > 0) & torch.isfinite(points).all(-1)
+    usable &= torch.isfinite(confidence) & (confidence > GUESSED_CONFIDENCE)
     points, confidence = points[usable], confidence[usable]
     count = min(config.points, len(points))
     confidence, least = torch.topk(confidence, count, largest=False)
@@ -155,7 +156,7 @@ def _seen_from(candidate: Keyframe, last: Keyframe, points: Tensor, config: Sigm
     confidence = candidate.confidence[at[:, 1], at[:, 0]].double()
     # Both depths are in the candidate's unit; where they differ, something stands between.
     same = torch.log(own[:, 2] / X[:, 2]).abs() < config.depth_tolerance
-    visible = inside & same & torch.isfinite(confidence)
+    visible = inside & same & (confidence > GUESSED_CONFIDENCE)
     to_ray = rays.ray_derivative(own)
     noise = _covariance(own, confidence, _typical(last), candidate.K, config)
     floor = config.sigma_ray ** 2 * torch.eye(3, dtype=X.dtype, device=X.device)
@@ -168,22 +169,23 @@ def _covariance(points: Tensor, confidence: Tensor, typical: float, K: Tensor,
                 config: SigmaConfig) -> Tensor:
     """Pixel and depth noise through the inverse projection z K^-1 (u, v, 1): [N,3,3].
 
-    points: [N,3]. confidence: [N], accumulated over observations; ``typical`` is one that a single
-    observation gives, for the unit of a model's confidence is its own.
+    points: [N,3]. confidence: [N], above 1 and accumulated over observations; ``typical`` is what
+    a single observation adds to it, for the unit of a model's confidence is its own.
     """
     z = points[:, 2]
     J = points.new_zeros(len(points), 3, 3)
     J[:, 0, 0], J[:, 1, 1] = z / K[0, 0], z / K[1, 1]
     J[:, :, 2] = points / z[:, None]
     pixel = torch.full_like(z, config.sigma_px ** 2)
-    depth = (config.sigma_depth * z).square() * typical / confidence
+    depth = (config.sigma_depth * z).square() * typical / (confidence - 1.0)
     return (J * torch.stack([pixel, pixel, depth], -1)[:, None, :]) @ J.mT
 
 
 def _typical(keyframe: Keyframe) -> float:
-    """The median confidence that one observation brought to the keyframe."""
-    finite = keyframe.confidence[torch.isfinite(keyframe.confidence)]
-    return float(finite.median()) / keyframe.observations if len(finite) else 1.0
+    """The median confidence above 1 that one observation brought to the keyframe."""
+    seen = keyframe.confidence[torch.isfinite(keyframe.confidence)
+                               & (keyframe.confidence > GUESSED_CONFIDENCE)]
+    return float(seen.median() - 1.0) / keyframe.observations if len(seen) else 1.0
 
 
 def _det(M: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..geometry import camera, sim3
-from ..registration.flow import build_pyramid, refine
+from ..registration.flow import refine
 from ..registration.rigid import solve_rigid
 from ..registration.scale import ScaleEstimate, log_depth_ratio
 from ..types import KeyframeEvent
@@ -56,7 +56,9 @@ class OneWay:
     """Where the target camera is, as the reference keyframe's points see it.
 
     T_target_ref: rigid [4,4], in the reference keyframe's unit. scale: the factor from the
-    target keyframe's unit to the reference's. matched_fraction: of the reference's samples.
+    target keyframe's unit to the reference's. matched_fraction: share of the reference's samples
+    whose surroundings look the same in the target's image, warped by the solution; more than the
+    flow's matches, which select themselves. kappa: reduced chi-square of the solution.
     sigma: [6] (translation, rotation) of T_target_ref's left perturbation.
     """
 
@@ -86,14 +88,14 @@ def register(reference: View, target: View, T_target_ref_guess: Tensor) -> OneWa
                                spread_ref=_DEPTH_ERROR * points[valid])
         T = solution.T_cam_ref
     good = np.flatnonzero(valid)[solution.inliers]
-    good = good[_similarity(reference, target, T)[uv_ref[good, 1], uv_ref[good, 0]]
-                > _MIN_SIMILARITY]
+    alike = _similarity(reference, target, T)[uv_ref[:, 1], uv_ref[:, 0]] > _MIN_SIMILARITY
+    good = good[alike[good]]
     if len(good) < _MIN_POINTS:
         return None
     covariance = np.linalg.inv(solution.information + 1e-9 * np.eye(6))
     # Errors of neighbouring points are alike: only about one in 25 counts (as in ScaleEstimate).
     sigma = np.sqrt(25.0 * max(solution.kappa, 1.0) * np.diag(covariance))
-    return OneWay(T, _scale(target, T, points[good], uv_target[good]), len(good) / len(points),
+    return OneWay(T, _scale(target, T, points[good], uv_target[good]), float(alike.mean()),
                   solution.kappa, sigma)
 
 
@@ -121,8 +123,7 @@ def _match(reference: View, target: View, T_target_ref: Tensor,
     predicted = _predict(reference, target.K, T_target_ref)
     warped = _look_up(target.grey, predicted)
     uv_ref = reference.samples.astype(np.float32)
-    flow = refine(build_pyramid(reference.grey), build_pyramid(warped), uv_ref, uv_ref,
-                  max_move_px=reach_px)
+    flow = refine(reference.grey, warped, uv_ref, uv_ref, max_move_px=reach_px)
     # The flow ends in the warped image; the prediction there says where that is in the target.
     uv = _look_up(predicted, flow.uv_b[:, None])[:, 0]
     height, width = target.grey.shape

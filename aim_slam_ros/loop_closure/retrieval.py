@@ -94,5 +94,6 @@ class Retrieval:
         if len(self._ids) < capacity:
             return
         grown = torch.empty(max(_FIRST_CAPACITY, 2 * capacity), size)
-        grown[:capacity] = self._descriptors
+        if capacity:
+            grown[:capacity] = self._descriptors
         self._descriptors = grown

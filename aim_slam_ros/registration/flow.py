@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 
 WINDOW_PX = 21
-LEVELS = 3
+LEVELS = 3        # a search over the whole pyramid: reaches some 90 px
+TIGHT_LEVELS = 1  # enough from a prediction that is right within some 12 px
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.02)
 
 
@@ -32,13 +33,14 @@ def _flow(a: np.ndarray, b: np.ndarray, uv_a: np.ndarray, uv_b: np.ndarray,
 
 
 def refine(a: np.ndarray, b: np.ndarray, uv_a: np.ndarray, uv_b_predicted: np.ndarray,
-           max_move_px: float = 14.0, max_round_trip_px: float = 0.7,
+           max_move_px: float = 14.0, max_round_trip_px: float | None = 0.7,
            levels: int = LEVELS) -> FlowMatches:
     """Find the points uv_a [N,2] of image a in image b ([H,W] uint8 both), starting where they are predicted.
 
     A match is valid when it stays within max_move_px of its prediction, inside the image, and
-    flowing back from it returns to within max_round_trip_px of where it started. Predictions that
-    are not finite or lie outside b give no match. levels: 0 searches only at full resolution.
+    flowing back from it returns to within max_round_trip_px of where it started (None: do not
+    look). Predictions that are not finite or lie outside b give no match. levels: 0 searches only
+    at full resolution.
     """
     uv_b = np.array(uv_b_predicted, np.float32)
     valid = _inside(uv_b, b)
@@ -49,12 +51,10 @@ def refine(a: np.ndarray, b: np.ndarray, uv_a: np.ndarray, uv_b_predicted: np.nd
     found, ok = _flow(a, b, start, uv_b[rows], levels)
     ok &= np.linalg.norm(found - uv_b[rows], axis=1) <= max_move_px
     ok &= _inside(found, b)
-    kept = rows[ok]
-    valid[:] = False
-    if kept.size:
+    if max_round_trip_px is not None and ok.any():
         back, back_ok = _flow(b, a, found[ok], start[ok], levels)
-        back_ok &= np.linalg.norm(back - start[ok], axis=1) <= max_round_trip_px
-        valid[kept] = back_ok
+        ok[ok] = back_ok & (np.linalg.norm(back - start[ok], axis=1) <= max_round_trip_px)
+    valid[rows] = ok
     uv_b[rows] = found
     return FlowMatches(uv_b, valid)
 

@@ -60,11 +60,11 @@ def _costs(small: np.ndarray, K: np.ndarray, source: Source, rhos: np.ndarray) -
 
 
 def _mean_of_best(volume: np.ndarray) -> np.ndarray:
-    """Mean of the two lowest costs: an occlusion in one source does not spoil the others."""
+    """Mean without the highest cost: an occlusion in one source does not spoil the others."""
     if len(volume) == 2:
         # Of two sources one may be occluded: lean on the better.
         return 0.35 * volume.max(0) + 0.65 * volume.min(0)
-    return 0.5 * np.partition(volume, 1, axis=0)[:2].sum(0)
+    return (volume.sum(0) - volume.max(0)) / (len(volume) - 1)
 
 
 def _parabola(cost: np.ndarray, best: np.ndarray) -> np.ndarray:
