@@ -84,7 +84,8 @@ class _Section:
 
 @dataclass(frozen=True)
 class CameraConfig(_Section):
-    width: int = _setting(518, 'width of the image the model sees [px], a multiple of 14', 84, 1036)
+    width: int = _setting(
+        518, 'width of the image the model sees [px], a multiple of 14', 84, 1036)
     use_calibration: bool = _setting(
         False, "take the dataset's or camera_info's intrinsics instead of estimating them")
     fov_deg: float = _setting(
@@ -174,15 +175,16 @@ class LoopClosureConfig(_Section):
 
     enabled: bool = _setting(True, 'look for loops; otherwise only collect and fuse keyframes')
     candidates: int = _setting(2, 'most similar keyframes that are verified', 1, 10)
-    min_gap: int = _setting(8, 'keyframes nearer in time than this many are no candidates', 1, 1000)
+    min_gap: int = _setting(
+        8, 'keyframes nearer in time than this many are no candidates', 1, 1000)
     covisible_hops: int = _setting(
         2, 'keyframes within this many edges are no candidates', 0, 10)
     similarity: float = _setting(
-        0.5, "least similarity of a candidate: 0 is the median over all keyframes, 1 the best of "
+        0.5, 'least similarity of a candidate: 0 is the median over all keyframes, 1 the best of '
         "the keyframe's neighbours", 0, 1)
     min_matched: float = _setting(
-        0.15, "fraction of a keyframe's textured points around which the other must look the same, "
-        'in both directions', 0, 1)
+        0.15, "fraction of a keyframe's textured points around which the other must look the "
+        'same, in both directions', 0, 1)
     max_kappa: float = _setting(2.0, 'largest reduced chi-square of a verified loop', 0.1, 1000)
     max_disagreement: float = _setting(
         0.08, 'largest difference between the two directions of a loop, relative to the median '

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Callable, Iterator, Sequence as Indices
 
 import cv2
@@ -71,6 +72,7 @@ class _Run:
             return None
         result = self._frontend.process(int(self._sequence.stamps_ns[index]), image,
                                         self._sequence.K)
+        self._take_late(result)
         self._results.append(result)
         for stage, seconds in result.stage_s.items():
             self._stage_s[stage] += seconds
@@ -81,6 +83,14 @@ class _Run:
                 with self._timed('correct'):
                     self._frontend.apply_correction(correction)
         return result
+
+    def _take_late(self, result: FrameResult) -> None:
+        """Images that waited for the map have their poses now; what they cost stays theirs."""
+        late = {waited.stamp_ns: waited for waited in result.late}
+        for row, old in enumerate(self._results if late else ()):
+            if old.stamp_ns in late:
+                self._results[row] = replace(late[old.stamp_ns], inferences=old.inferences,
+                                             stage_s=old.stage_s)
 
     def _read(self, index: int) -> np.ndarray | None:
         with self._timed('read'):

@@ -44,7 +44,7 @@ def drifted_walk() -> Walk:
 def verified(newer: int, older: int, model: RoomModel | None = None) -> Verification:
     verifier = LoopVerifier(LoopClosureConfig(), model or RoomModel())
     truth = true_poses(range(len(places())))
-    return verifier.verify(*(event(i, truth[i]) for i in (newer, older)),
+    return verifier.verify(event(newer, truth[newer]), event(older, truth[older]),
                            [event(i, truth[i]) for i in (older + 1, newer - 1)])
 
 
@@ -52,7 +52,7 @@ def stacked(poses: tuple[KeyframePose, ...]) -> torch.Tensor:
     return torch.stack([p.T_world_kf for p in poses])
 
 
-def test_a_true_loop_is_verified_with_its_relative_pose_and_scale():
+def test_a_true_loop_is_verified_with_its_relative_pose_and_scale() -> None:
     found = verified(LAST, 0)
     T_true = sim3.inverse(true_poses([0])[0]) @ true_poses([LAST])[0]
     assert found.accepted, found.reason
@@ -66,13 +66,13 @@ def test_a_true_loop_is_verified_with_its_relative_pose_and_scale():
 
 
 @pytest.mark.parametrize('older', [8, 12, 16, 20, 24])
-def test_other_places_are_refused_even_when_the_model_claims_they_are_the_same(older: int):
+def test_other_places_are_refused_even_when_the_model_claims_they_are_the_same(older: int) -> None:
     # A model that is shown two places tends to lay them over each other.
     lying = RoomModel(lie=[places()[older].stamp_ns])
     assert not verified(LAST, older, lying).accepted
 
 
-def test_a_textureless_image_is_refused():
+def test_a_textureless_image_is_refused() -> None:
     truth = true_poses(range(len(places())))
     blank = dataclasses.replace(event(0, truth[0]), image=np.full_like(places()[0].image, 90))
     found = LoopVerifier(LoopClosureConfig(), RoomModel()).verify(
@@ -80,7 +80,7 @@ def test_a_textureless_image_is_refused():
     assert not found.accepted and found.reason
 
 
-def test_images_of_different_sizes_are_refused_without_asking_the_model():
+def test_images_of_different_sizes_are_refused_without_asking_the_model() -> None:
     truth = true_poses(range(len(places())))
     other = event(0, truth[0])
     smaller = dataclasses.replace(other, image=other.image[::2, ::2])
@@ -90,7 +90,7 @@ def test_images_of_different_sizes_are_refused_without_asking_the_model():
     assert model.inferences == 0
 
 
-def test_images_are_encoded_once():
+def test_images_are_encoded_once() -> None:
     truth = true_poses(range(len(places())))
     model = RoomModel()
     verifier = LoopVerifier(LoopClosureConfig(), model)
@@ -99,7 +99,7 @@ def test_images_are_encoded_once():
     assert len(model.encoded) == len(set(model.encoded)) == 4
 
 
-def test_the_walk_closes_and_the_drift_goes():
+def test_the_walk_closes_and_the_drift_goes() -> None:
     done = drifted_walk()
     truth = true_poses(range(len(places())))
     before = ate(torch.stack([e.T_world_kf for e in drifting_events(0.15)]), truth)
@@ -108,7 +108,7 @@ def test_the_walk_closes_and_the_drift_goes():
     assert after < 0.4 * before
 
 
-def test_no_false_loop_is_accepted_on_the_walk():
+def test_no_false_loop_is_accepted_on_the_walk() -> None:
     truth = true_poses(range(len(places())))
     for loop in drifted_walk().pipeline.loops:
         T_true = sim3.inverse(truth[loop.older]) @ truth[loop.newer]
@@ -116,7 +116,7 @@ def test_no_false_loop_is_accepted_on_the_walk():
         assert float((loop.T_older_newer - T_true)[:3, 3].norm()) < 0.25
 
 
-def test_corrections_hold_all_keyframes_and_count_up():
+def test_corrections_hold_all_keyframes_and_count_up() -> None:
     done = drifted_walk()
     assert [c.version for c in done.corrections] == list(range(1, len(done.corrections) + 1))
     last = done.corrections[-1]
@@ -124,14 +124,14 @@ def test_corrections_hold_all_keyframes_and_count_up():
     assert [p.keyframe_id for p in last.poses] == list(range(known))
 
 
-def test_a_resent_keyframe_changes_nothing():
+def test_a_resent_keyframe_changes_nothing() -> None:
     done = walk(drifting_events(0.15)[:4])
     before = stacked(done.pipeline.poses)
     assert done.pipeline.add(drifting_events(0.3)[2]) is None
     assert torch.equal(stacked(done.pipeline.poses), before)
 
 
-def test_switched_off_it_collects_and_maps_but_asks_nothing():
+def test_switched_off_it_collects_and_maps_but_asks_nothing() -> None:
     events = drifting_events(0.15)
     done = walk(events, enabled=False)
     assert not done.corrections and not done.pipeline.loops and done.model.inferences == 0
@@ -140,7 +140,7 @@ def test_switched_off_it_collects_and_maps_but_asks_nothing():
     assert len(done.pipeline.fused_map().points) > 1000
 
 
-def test_a_loop_joins_two_pieces_in_the_older_world():
+def test_a_loop_joins_two_pieces_in_the_older_world() -> None:
     done = walk(drifting_events(0.0, piece_from=18))
     truth = true_poses(range(len(places())))
     poses = stacked(done.pipeline.poses)
@@ -150,21 +150,21 @@ def test_a_loop_joins_two_pieces_in_the_older_world():
     assert ate(poses, truth) < 0.15
 
 
-def test_keyframes_that_the_frontend_moved_are_followed():
+def test_keyframes_that_the_frontend_moved_are_followed() -> None:
     events = drifting_events(0.0)[:3]
     T_moved = events[1].T_world_kf @ sim3.exp(torch.full((7,), 0.02, dtype=torch.float64))
     events[2] = dataclasses.replace(events[2], moved=(KeyframePose(1, T_moved),))
     assert torch.allclose(walk(events).pipeline.poses[1].T_world_kf, T_moved)
 
 
-def test_an_edge_to_a_lost_keyframe_waits_for_it():
+def test_an_edge_to_a_lost_keyframe_waits_for_it() -> None:
     events = drifting_events(0.0)[:4]
     pipeline = walk([events[0], events[2], events[3]]).pipeline
     pipeline.add(events[1])
     assert [p.keyframe_id for p in pipeline.poses] == [0, 2, 3, 1]
 
 
-def test_new_keyframes_are_chained_on_in_the_corrected_world():
+def test_new_keyframes_are_chained_on_in_the_corrected_world() -> None:
     events = drifting_events(0.15)
     done = walk(events)
     assert done.corrections

@@ -74,7 +74,7 @@ def _circle(count: int) -> Tensor:
     return sim3.from_parts(unit, R, centre)
 
 
-def test_poses_round_trip_and_act_the_same():
+def test_poses_round_trip_and_act_the_same() -> None:
     T = random_pose(0)
     S = pose_graph.to_gtsam(T)
     assert torch.allclose(pose_graph.from_gtsam(S), T, atol=1e-12)
@@ -83,13 +83,13 @@ def test_poses_round_trip_and_act_the_same():
         sim3.transform(T, torch.from_numpy(point)).numpy())
 
 
-def test_products_and_inverses_mean_the_same_on_both_sides():
+def test_products_and_inverses_mean_the_same_on_both_sides() -> None:
     a, b = random_pose(1), random_pose(2)
     product = pose_graph.to_gtsam(a).inverse().compose(pose_graph.to_gtsam(b))
     assert torch.allclose(pose_graph.from_gtsam(product), sim3.inverse(a) @ b, atol=1e-12)
 
 
-def test_a_left_perturbation_costs_what_its_sigma_says():
+def test_a_left_perturbation_costs_what_its_sigma_says() -> None:
     # The factor's error at exp(xi) T must be half the squared length of xi / sigma, for whatever
     # T: this checks the order, the side and the adjoint at once.
     T = random_pose(4)
@@ -106,7 +106,7 @@ def test_a_left_perturbation_costs_what_its_sigma_says():
         assert factor.error(values) == pytest.approx(2.0, rel=1e-6)
 
 
-def test_a_loop_edge_removes_the_drift():
+def test_a_loop_edge_removes_the_drift() -> None:
     drifted = ring()
     before = drifted.error()
     drifted.close(0, 59)
@@ -118,7 +118,7 @@ def test_a_loop_edge_removes_the_drift():
 
 
 @pytest.mark.parametrize('true_loops', [1, 3])
-def test_a_false_loop_does_not_ruin_it(true_loops: int):
+def test_a_false_loop_does_not_ruin_it(true_loops: int) -> None:
     drifted = ring()
     before = drifted.error()
     for k in range(true_loops):
@@ -128,7 +128,7 @@ def test_a_false_loop_does_not_ruin_it(true_loops: int):
     assert drifted.error() < 0.4 * before
 
 
-def test_a_false_loop_alone_leaves_the_odometry():
+def test_a_false_loop_alone_leaves_the_odometry() -> None:
     drifted = ring()
     before = drifted.estimate()
     drifted.close_falsely(15, 45)
@@ -137,8 +137,8 @@ def test_a_false_loop_alone_leaves_the_odometry():
     assert float((drifted.estimate() - before)[:, :3, 3].norm(dim=1).max()) < 0.3
 
 
-def test_large_drift_with_confident_edges_is_still_recognised():
-    # 30 % against a sigma of .3 % per edge: without annealing the true loop passes for a false one.
+def test_large_drift_with_confident_edges_is_still_recognised() -> None:
+    # 30 % against .3 % per edge: without annealing the true loop would pass for a false one.
     drifted = ring(scale_drift=0.3, sigma=0.3 * SIGMA)
     before = drifted.error()
     drifted.close(0, 59, 0.3 * SIGMA)
@@ -146,14 +146,14 @@ def test_large_drift_with_confident_edges_is_still_recognised():
     assert drifted.error() < 0.1 * before
 
 
-def test_without_loops_nothing_moves():
+def test_without_loops_nothing_moves() -> None:
     drifted = ring(count=10)
     before = drifted.estimate()
     drifted.graph.optimise()
     assert torch.allclose(drifted.estimate(), before, atol=1e-9)
 
 
-def test_pieces_stay_solvable_and_where_they_were():
+def test_pieces_stay_solvable_and_where_they_were() -> None:
     graph = ring(count=5).graph
     graph.add_keyframe(100, random_pose(6))
     graph.add_keyframe(101, random_pose(7))
@@ -164,7 +164,7 @@ def test_pieces_stay_solvable_and_where_they_were():
 
 
 @pytest.mark.parametrize('backwards', [False, True])
-def test_a_loop_carries_the_newer_piece_into_the_world_of_the_older(backwards: bool):
+def test_a_loop_carries_the_newer_piece_into_the_world_of_the_older(backwards: bool) -> None:
     graph = PoseGraph()
     T_world = [random_pose(k, 0.3) for k in range(4)]
     T_away = random_pose(9)
@@ -178,7 +178,7 @@ def test_a_loop_carries_the_newer_piece_into_the_world_of_the_older(backwards: b
     assert torch.allclose(torch.stack(list(poses.values())), torch.stack(T_world), atol=1e-6)
 
 
-def test_neighbourhoods():
+def test_neighbourhoods() -> None:
     graph = ring(count=20).graph
     graph.add_keyframe(20, sim3.identity())     # a piece of its own
     assert graph.within(10, 2) == {8, 9, 10, 11, 12}
@@ -187,7 +187,7 @@ def test_neighbourhoods():
     assert graph.neighbourhood(20, hops=1, gap=5) == {20}
 
 
-def test_a_new_keyframe_is_chained_to_the_mean_of_its_edges():
+def test_a_new_keyframe_is_chained_to_the_mean_of_its_edges() -> None:
     graph = ring(count=3, scale_drift=0.0, rotation_drift=0.0).graph
     T_new = random_pose(2)
     edges = [PoseEdge(k, 7, sim3.inverse(graph.pose(k)) @ T_new, SIGMA) for k in (1, 2)]
@@ -196,7 +196,7 @@ def test_a_new_keyframe_is_chained_to_the_mean_of_its_edges():
     assert graph.chained(8, edges) is None
 
 
-def test_unusable_input_is_refused_with_the_reason():
+def test_unusable_input_is_refused_with_the_reason() -> None:
     graph = ring(count=3).graph
     with pytest.raises(PoseGraphError, match='never be reused'):
         graph.add_keyframe(1, sim3.identity())

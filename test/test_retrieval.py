@@ -26,7 +26,7 @@ def circle(views: int, step: float) -> Retrieval:
     return retrieval
 
 
-def test_a_revisited_place_is_found_best_first():
+def test_a_revisited_place_is_found_best_first() -> None:
     retrieval = circle(60, 6.2832 / 50)     # keyframe 55 looks like keyframe 5
     found = retrieval.candidates(55, set(range(45, 60)))
     assert [c.keyframe_id for c in found][0] == 5
@@ -34,18 +34,18 @@ def test_a_revisited_place_is_found_best_first():
     assert found[0].similarity == pytest.approx(1.0, abs=1e-3)
 
 
-def test_nothing_is_found_where_nothing_was_revisited():
+def test_nothing_is_found_where_nothing_was_revisited() -> None:
     retrieval = circle(30, 6.2832 / 50)
     assert retrieval.candidates(29, set(range(20, 30))) == ()
 
 
-def test_the_neighbourhood_and_the_keyframe_itself_are_no_candidates():
+def test_the_neighbourhood_and_the_keyframe_itself_are_no_candidates() -> None:
     retrieval = circle(60, 6.2832 / 50)
     near = set(range(45, 60)) | set(range(0, 12))
     assert not {c.keyframe_id for c in retrieval.candidates(55, near)} & near
 
 
-def test_alone_or_without_any_reference_there_is_no_candidate():
+def test_alone_or_without_any_reference_there_is_no_candidate() -> None:
     retrieval = Retrieval(LoopClosureConfig())
     retrieval.add(0, around(0.0))
     assert retrieval.candidates(0, {0}) == ()
@@ -53,21 +53,21 @@ def test_alone_or_without_any_reference_there_is_no_candidate():
     assert retrieval.candidates(7, {7}) == ()
 
 
-def test_the_first_keyframe_of_a_piece_is_judged_by_what_was_usual_before():
+def test_the_first_keyframe_of_a_piece_is_judged_by_what_was_usual_before() -> None:
     retrieval = circle(40, 6.2832 / 50)
     retrieval.candidates(39, set(range(30, 40)))
     retrieval.add(40, around(6.2832 / 50 * 12))
     assert retrieval.candidates(40, {40})[0].keyframe_id == 12
 
 
-def test_nothing_passes_where_all_views_look_alike():
+def test_nothing_passes_where_all_views_look_alike() -> None:
     retrieval = Retrieval(LoopClosureConfig())
     for k in range(30):
         retrieval.add(k, torch.ones(8))
     assert retrieval.candidates(29, set(range(20, 30))) == ()
 
 
-def test_ids_need_not_be_dense_and_storage_grows():
+def test_ids_need_not_be_dense_and_storage_grows() -> None:
     retrieval = Retrieval(LoopClosureConfig())
     for k in range(300):
         retrieval.add(10 * k, around(6.2832 / 250 * k))
@@ -76,7 +76,7 @@ def test_ids_need_not_be_dense_and_storage_grows():
     assert retrieval.candidates(2990, near)[0].keyframe_id == 490
 
 
-def test_lengths_do_not_matter():
+def test_lengths_do_not_matter() -> None:
     retrieval = Retrieval(LoopClosureConfig())
     for k in range(60):
         retrieval.add(k, (1 + k) * around(6.2832 / 50 * k))
@@ -84,7 +84,7 @@ def test_lengths_do_not_matter():
 
 
 @pytest.mark.parametrize('bad', [torch.ones(5), torch.ones(2, 32), torch.full((64,), torch.nan)])
-def test_a_descriptor_of_another_kind_is_refused(bad: Tensor):
+def test_a_descriptor_of_another_kind_is_refused(bad: Tensor) -> None:
     retrieval = circle(3, 0.1)
     with pytest.raises(RetrievalError, match='same geometry model'):
         retrieval.add(3, bad)

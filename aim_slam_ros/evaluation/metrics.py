@@ -45,6 +45,7 @@ def write(path: Path, metrics: Mapping[str, Metric]) -> None:
 def _counts(run: RunResult) -> dict[str, Metric]:
     """A frame is tracked only when its pose belongs to the largest connected map.
 
+    frames_late: of them, those that waited for the map to begin and were placed afterwards.
     mean_window counts views: the keyframes of an inference and the current frame.
     """
     tracked = len(run.tracked)
@@ -52,6 +53,7 @@ def _counts(run: RunResult) -> dict[str, Metric]:
         'frames_offered': run.offered,
         'frames_tracked': tracked,
         'tracked_percent': _ratio(100.0 * tracked, run.offered),
+        'frames_late': sum(len(result.late) for result in run.results),
         'frames_skipped': run.count(TrackingStatus.SKIPPED),
         'frames_unreadable': len(run.unreadable),
         'frames_lost': run.count(TrackingStatus.LOST),

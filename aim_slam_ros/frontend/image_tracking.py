@@ -13,13 +13,10 @@ import torch
 from torch import Tensor
 
 from ..config import FollowingConfig, TrackingConfig
-from ..geometry import camera, sim3
-from ..registration.flow import refine
+from ..geometry import sim3
 from ..registration.rigid import RigidSolution, solve_rigid
 from ..registration.scale import log_depth_ratio
-from ..types import Keyframe
 from .alignment import pose_mean
-from .landmarks import relative_depth_sigma
 from .matching import PredictedMatches, predict_matches
 from .tracking import TrackingResult, TrackingWindow
 
@@ -36,10 +33,10 @@ class ImageTracker:
     def track(self, window: TrackingWindow) -> TrackingResult:
         """Keyframes stay where they are. Fails where neither model nor images place the frame."""
         start = pose_mean(window, self._min_seen)
-        guess = window.T_world_frame_guess
-        if guess is None and start is None:
+        guess = start if window.T_world_frame_guess is None else window.T_world_frame_guess
+        if guess is None:
             return _failed('the model connected the image with no keyframe of its window')
-        rigid_start = sim3.rigid_part(guess if guess is not None else start)
+        rigid_start = sim3.rigid_part(guess)
         matches, solution = self._refined(window, rigid_start)
         if solution is None or self._strays(rigid_start, solution, matches):
             return self._fallback(start, matches)
@@ -53,8 +50,8 @@ class ImageTracker:
     def _refined(self, window: TrackingWindow,
                  T_world_cam: Tensor) -> tuple[PredictedMatches, RigidSolution | None]:
         K = window.prediction.K[0]
-        matches = predict_matches(window.keyframes, window.frame.grey, K, T_world_cam, self._config.stride,
-                                  self._following.sigma_depth)
+        matches = predict_matches(window.keyframes, window.frame.grey, K, T_world_cam,
+                                  self._config.stride, self._following.sigma_depth)
         if len(matches.uv) < self._config.min_matches:
             return matches, None
         return matches, solve_rigid(matches.points_world, matches.uv, K,

@@ -43,6 +43,7 @@ class Initialisation:
         self._window_tracker = window
         self._min_seen = min_seen
         self._offered = 0
+        self._wanted_px: float = config.min_parallax_px
         self._restart()
 
     def offer(self, frame: Frame, clock: Stopwatch) -> Beginning | None:

@@ -26,7 +26,7 @@ def relative_depth_sigma(confidence: Tensor, mean_confidence: float,
     """
     ratio = (confidence - 1.0).clamp_min(1e-6) / max(mean_confidence - 1.0, 1e-6)
     sigma = (sigma_at_mean / ratio.sqrt()).clamp(0.4 * sigma_at_mean, _SIGMA_GUESSED)
-    return torch.where(confidence < GUESSED_CONFIDENCE, torch.full_like(sigma, _SIGMA_GUESSED), sigma)
+    return sigma.masked_fill(confidence < GUESSED_CONFIDENCE, _SIGMA_GUESSED)
 
 
 @dataclass(frozen=True)

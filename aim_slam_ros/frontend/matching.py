@@ -51,8 +51,8 @@ def _of_one(keyframe: Keyframe, grey: np.ndarray, K: Tensor, T_world_cam: Tensor
             sigma_depth: float) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Grid points offered, and per match: point, spread (world), pixel, weight."""
     half = stride // 2
-    grid = camera.pixel_grid(keyframe.frame.height, keyframe.frame.width)[half::stride,
-                                                                         half::stride]
+    grid = camera.pixel_grid(keyframe.frame.height, keyframe.frame.width)
+    grid = grid[half::stride, half::stride]
     confidence = keyframe.confidence[half::stride, half::stride]
     seen = confidence >= torch.quantile(confidence, 0.2).clamp_min(GUESSED_CONFIDENCE)
     points = keyframe.points_cam[half::stride, half::stride][seen].double()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Sequence
+from typing import Any, Sequence
 
 import numpy as np
 from torch import Tensor
@@ -158,10 +158,9 @@ class FrontendPipeline:
         return (self._config.model.infer == 'every_image' or not followed.ok
                 or self._leaves_reference(followed))
 
-    def _relocalise(self, encoding: FrameEncoding, grey: np.ndarray, followed: Followed,
+    def _relocalise(self, encoding: FrameEncoding, followed: Followed,
                     clock: Stopwatch) -> Followed:
-        found = self._relocalisation.find(encoding, self._intrinsics(encoding.frame),
-                                          clock)
+        found = self._relocalisation.find(encoding, self._intrinsics(encoding.frame), clock)
         if found is None:
             return followed
         self._references.main_id = next(iter(found.fractions))
@@ -215,7 +214,7 @@ def _tracker(config: Config) -> Tracker:
     return ImageTracker(config.tracking, config.following, config.keyframes.min_confident)
 
 
-def _window_facts(estimate: WindowEstimate | None) -> dict[str, object]:
+def _window_facts(estimate: WindowEstimate | None) -> dict[str, Any]:
     """What a FrameResult says about the inference."""
     if estimate is None:
         return {}

@@ -109,4 +109,3 @@ def _carried(frame: Frame, followed: Followed, K: Tensor) -> tuple[Tensor, Tenso
     confidence[at[:, 1], at[:, 0]] = _CARRIED
     confidence = torch.nn.functional.max_pool2d(confidence[None, None], 5, 1, 2)[0, 0]
     return camera.unproject(1.0 / grid, K), confidence
-

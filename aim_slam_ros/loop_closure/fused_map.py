@@ -14,7 +14,6 @@ from ..config import LoopClosureConfig
 from ..geometry import sim3
 from ..types import Cloud, KeyframeEvent
 
-_MIN_SUPPORT = 3          # pixels in a voxel of a keyframe; fewer are stray points
 _MAX_DEPTH_JUMP = 0.08    # relative depth range in 3x3 pixels above which points hang in the air
 _MAX_DEPTH = 8.0          # in median depths; what lies beyond is not geometry any more
 _KNOWS_NOTHING = 1.01     # confidence up to which a depth is a prior
@@ -33,6 +32,14 @@ class _Thinned:
     colours: Tensor
     weights: Tensor
     median_depth: float
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """index: [N] int64, the occupied voxel of each point, 0 to count - 1."""
+
+    index: Tensor
+    count: int
 
 
 class FusedMap:
@@ -67,14 +74,6 @@ class FusedMap:
                      _cell_mean(colours, weights, cells).round().to(torch.uint8).numpy())
 
 
-@dataclass(frozen=True)
-class _Cells:
-    """index: [N] int64, the cell of each point, 0 to count - 1. sizes: [count] int64."""
-
-    index: Tensor
-    sizes: Tensor
-
-
 def _usable(event: KeyframeEvent, percentile: float) -> Tensor:
     """[H,W] bool: confident, finite, in front, not far outside, on no depth edge."""
     z = event.points_cam[..., 2]
@@ -101,27 +100,29 @@ def _thin(event: KeyframeEvent, usable: Tensor, voxel_fraction: float) -> _Thinn
     weights = event.confidence[usable].to(torch.float32)
     median_depth = float(points[:, 2].median())
     cells = _cells(points, voxel_fraction * median_depth)
-    supported = cells.sizes >= _MIN_SUPPORT
-    total = torch.zeros(len(cells.sizes)).index_add_(0, cells.index, weights)
-    return _Thinned(_cell_mean(points, weights, cells)[supported],
-                    _cell_mean(colours, weights, cells)[supported],
-                    total[supported], median_depth)
+    total = torch.zeros(cells.count).index_add_(0, cells.index, weights)
+    return _Thinned(_cell_mean(points, weights, cells), _cell_mean(colours, weights, cells),
+                    total, median_depth)
 
 
 def _cells(points: Tensor, voxel: float) -> _Cells:
-    """Voxels of points [N,3]; coordinates beyond 2^20 voxels from the median share the border."""
-    cell = torch.floor((points.double() - points.double().median(0).values) / voxel)
+    """Voxels of points [N,3]; coordinates beyond 2^20 voxels from the median share the border.
+
+    The median point, often a voxel's mean itself, is put into a voxel's middle, where rounding
+    cannot tip its likes over.
+    """
+    cell = torch.round((points.double() - points.double().median(0).values) / voxel)
     half = 2 ** (_BITS - 1)
     i, j, k = (cell.clamp(-half, half - 1).long() + half).unbind(-1)
     key = (i << 2 * _BITS) | (j << _BITS) | k
-    _, index, sizes = key.unique(return_inverse=True, return_counts=True)
-    return _Cells(index, sizes)
+    occupied, index = key.unique(return_inverse=True)
+    return _Cells(index, len(occupied))
 
 
 def _cell_mean(values: Tensor, weights: Tensor, cells: _Cells) -> Tensor:
     """Weighted mean of values [N,3] in each cell, [count,3] float32."""
-    total = torch.zeros(len(cells.sizes), dtype=torch.float64)
+    total = torch.zeros(cells.count, dtype=torch.float64)
     total.index_add_(0, cells.index, weights.double())
-    summed = torch.zeros(len(cells.sizes), 3, dtype=torch.float64)
+    summed = torch.zeros(cells.count, 3, dtype=torch.float64)
     summed.index_add_(0, cells.index, values.double() * weights.double()[:, None])
     return (summed / total[:, None].clamp_min(1e-12)).to(torch.float32)

@@ -7,6 +7,7 @@ have (they agree by construction); what the images say about them does.
 from __future__ import annotations
 
 from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -35,12 +36,12 @@ def _flow(a: np.ndarray, b: np.ndarray, uv_a: np.ndarray, uv_b: np.ndarray,
 def refine(a: np.ndarray, b: np.ndarray, uv_a: np.ndarray, uv_b_predicted: np.ndarray,
            max_move_px: float = 14.0, max_round_trip_px: float | None = 0.7,
            levels: int = LEVELS) -> FlowMatches:
-    """Find the points uv_a [N,2] of image a in image b ([H,W] uint8 both), starting where they are predicted.
+    """Find the points uv_a [N,2] of image a in image b ([H,W] uint8 both).
 
-    A match is valid when it stays within max_move_px of its prediction, inside the image, and
-    flowing back from it returns to within max_round_trip_px of where it started (None: do not
-    look). Predictions that are not finite or lie outside b give no match. levels: 0 searches only
-    at full resolution.
+    The search starts where they are predicted. A match is valid when it stays within max_move_px
+    of its prediction, inside the image, and flowing back from it returns to within
+    max_round_trip_px of where it started (None: do not look). Predictions that are not finite or
+    lie outside b give no match. levels: 0 searches only at full resolution.
     """
     uv_b = np.array(uv_b_predicted, np.float32)
     valid = _inside(uv_b, b)
@@ -61,4 +62,5 @@ def refine(a: np.ndarray, b: np.ndarray, uv_a: np.ndarray, uv_b_predicted: np.nd
 
 def _inside(uv: np.ndarray, image: np.ndarray) -> np.ndarray:
     with np.errstate(invalid='ignore'):
-        return ((uv >= 0) & (uv <= (image.shape[1] - 1, image.shape[0] - 1))).all(axis=1)
+        ok: np.ndarray = (uv >= 0) & (uv <= (image.shape[1] - 1, image.shape[0] - 1))
+    return np.logical_and(ok[:, 0], ok[:, 1])

@@ -80,7 +80,8 @@ def _linearise(bundle: Bundle, seen: Observations) -> tuple[np.ndarray, np.ndarr
         np.stack([w, zero, -w * a, -a * b, 1 + a * a, -b], 1),
         np.stack([zero, w, -w * b, -(1 + b * b), a * b, a], 1)], 1)
     t = T[:, :3, 3]
-    J_rho = seen.focal_px * np.stack([t[:, 0] - a * t[:, 2], t[:, 1] - b * t[:, 2]], 1) / z[:, None]
+    J_rho = np.stack([t[:, 0] - a * t[:, 2], t[:, 1] - b * t[:, 2]], 1)
+    J_rho *= seen.focal_px / z[:, None]
     return residual, J_pose, J_rho
 
 
@@ -103,9 +104,9 @@ def _step(bundle: Bundle, seen: Observations, residual: np.ndarray, J_pose: np.n
         g[v] = gradients[seen.view == v].sum(0)
     cross = np.zeros((views, points, 6))
     np.add.at(cross, (seen.view, seen.point), np.einsum('nij,ni->nj', WJ, J_rho))
-    h_rho = np.bincount(seen.point, weight * (J_rho ** 2).sum(1), points)
+    curvature = np.bincount(seen.point, weight * (J_rho ** 2).sum(1), points)
     g_rho = np.bincount(seen.point, weight * (J_rho * residual).sum(1), points)
-    h_rho = h_rho * (1.0 + damping) + 1.0   # 1 px^2: a weak prior where there is no parallax
+    h_rho = curvature * (1.0 + damping) + 1.0   # 1 px^2: a weak prior where there is no parallax
     flat = cross.transpose(0, 2, 1).reshape(views * 6, points)
     H_full = H.reshape(views * 6, views * 6)
     H_full = H_full + damping * np.diag(np.diag(H_full) + 1e-6)

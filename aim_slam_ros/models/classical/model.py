@@ -46,7 +46,8 @@ class ClassicalModel:
     def infer(self, encodings: Sequence[FrameEncoding]) -> WindowPrediction:
         frames = [e.frame for e in encodings]
         if len(frames) < self.min_views:
-            raise ValueError(f'the classical model needs {self.min_views} views, not {len(frames)}')
+            raise ValueError(
+                f'the classical model needs {self.min_views} views, not {len(frames)}')
         if len({frame.image.shape for frame in frames}) != 1:
             raise ValueError('all views of a window must have the same size')
         K = [self._intrinsics(frame) for frame in frames]
@@ -92,7 +93,8 @@ class ClassicalModel:
             return []
         T_source_ref = sim3.inverse(poses.T_first_view) @ poses.T_first_view[i]
         baseline = T_source_ref[:, :3, 3].norm(dim=1).numpy()
-        usable = [j for j in np.flatnonzero(poses.connected) if j != i and baseline[j] > 0.01]
+        usable = [j for j in np.flatnonzero(poses.connected).tolist()
+                  if j != i and baseline[j] > 0.01]
         usable.sort(key=lambda j: abs(np.log(baseline[j] / 0.12)))
         return [Source(features[j].small, K_small[j], T_source_ref[j].numpy())
                 for j in usable[:_SOURCES]]
