@@ -176,7 +176,8 @@ class LoopClosureConfig(_Section):
     enabled: bool = _setting(True, 'look for loops; otherwise only collect and fuse keyframes')
     candidates: int = _setting(2, 'most similar keyframes that are verified', 1, 10)
     min_gap: int = _setting(
-        8, 'keyframes nearer in time than this many are no candidates', 1, 1000)
+        8, 'keyframes nearer in time than this many are no candidates; a longer edge of the '
+        'frontend is verified as a loop', 1, 1000)
     covisible_hops: int = _setting(
         2, 'keyframes within this many edges are no candidates', 0, 10)
     similarity: float = _setting(

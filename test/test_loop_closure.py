@@ -108,6 +108,21 @@ def test_the_walk_closes_and_the_drift_goes() -> None:
     assert after < 0.4 * before
 
 
+def test_an_edge_of_the_frontend_across_the_loop_does_not_hide_the_drift() -> None:
+    # The frontend saw keyframe 0 again and wrote down where its drifted poses put it.
+    events = drifting_events(0.15)
+    drifted = torch.stack([e.T_world_kf for e in events])
+    across = dataclasses.replace(events[LAST].edges[0], a=0, b=LAST,
+                                 T_a_b=sim3.inverse(drifted[0]) @ drifted[LAST])
+    events[LAST] = dataclasses.replace(events[LAST], edges=(*events[LAST].edges, across))
+    # Nothing is retrieved by its looks: the edge alone must lead there.
+    blind = [dataclasses.replace(e, descriptor=torch.ones(4)) for e in events]
+    done = walk(blind)
+    truth = true_poses(range(len(places())))
+    assert [(loop.older, loop.newer) for loop in done.pipeline.loops] == [(0, LAST)]
+    assert ate(stacked(done.pipeline.poses), truth) < 0.4 * ate(drifted, truth)
+
+
 def test_no_false_loop_is_accepted_on_the_walk() -> None:
     truth = true_poses(range(len(places())))
     for loop in drifted_walk().pipeline.loops:

@@ -39,11 +39,11 @@ class ImageTracker:
         rigid_start = sim3.rigid_part(guess)
         matches, solution = self._refined(window, rigid_start)
         if solution is None or self._strays(rigid_start, solution, matches):
-            return self._fallback(start, matches)
+            return self._fallback(start, guess, matches)
         T_world_cam = sim3.inverse(solution.T_cam_ref)
         scale = self._scale(window, matches, solution)
         if not scale:
-            return self._fallback(start, matches)
+            return self._fallback(start, guess, matches)
         return TrackingResult(True, sim3.with_scale(T_world_cam, scale), solution.kappa,
                               matches.best_fraction(solution.inliers))
 
@@ -79,12 +79,14 @@ class ImageTracker:
                                 weight.sqrt() * torch.from_numpy(matches.weight[rows]))
         return ratio.scale if ratio.count else 0.0
 
-    def _fallback(self, start: Tensor | None, matches: PredictedMatches) -> TrackingResult:
-        """The model's own word, where the images have none."""
+    def _fallback(self, start: Tensor | None, guess: Tensor | None,
+                  matches: PredictedMatches) -> TrackingResult:
+        """Where the images add nothing: the pose it was followed to, else the model's own."""
         if start is None:
             return _failed(f'only {len(matches.uv)} matches were found in the images and the '
                            'model did not connect the window')
-        return TrackingResult(True, start, math.inf, matches.best_fraction(None))
+        T = start if guess is None else sim3.with_scale(guess, sim3.scale_of(start))
+        return TrackingResult(True, T, math.inf, matches.best_fraction(None))
 
 
 def _failed(reason: str) -> TrackingResult:

@@ -93,17 +93,17 @@ class KeyframeMap:
     def correct(self, corrected: CorrectedKeyframes) -> None:
         """Take the poses of a pose-graph optimisation.
 
-        Keyframes newer than it move along with the newest one that it knows.
+        The current piece's keyframes that are newer than it move along with the newest one that
+        it knows of this piece.
         """
         known = {pose.keyframe_id: pose.T_world_kf for pose in corrected.poses
                  if pose.keyframe_id in self._keyframes}
-        if not known:
-            return
-        newest = max(known)
-        T_new_old = known[newest] @ sim3.inverse(self._keyframes[newest].T_world_kf)
         poses = [KeyframePose(i, T) for i, T in known.items()]
-        poses += [KeyframePose(i, T_new_old @ self._keyframes[i].T_world_kf)
-                  for i in self._piece_ids if i > newest]
+        newest = max((i for i in self._piece_ids if i in known), default=None)
+        if newest is not None:
+            T_new_old = known[newest] @ sim3.inverse(self._keyframes[newest].T_world_kf)
+            poses += [KeyframePose(i, T_new_old @ self._keyframes[i].T_world_kf)
+                      for i in self._piece_ids if i > newest]
         self.move(poses)
 
     def overlapping(self, keyframe_id: int) -> tuple[Keyframe, ...]:

@@ -13,7 +13,7 @@ from ..config import Config
 from ..geometry import sim3
 from ..models.base import GeometryModel
 from ..types import (CorrectedKeyframes, Frame, FrameEncoding, FrameResult, Keyframe,
-                     KeyframeEvent, TrackingStatus)
+                     KeyframeEvent, KeyframePose, TrackingStatus)
 from .admission import Admission
 from .following import Followed, Follower
 from .image_tracking import ImageTracker
@@ -178,6 +178,7 @@ class FrontendPipeline:
         if encoding is None or estimate is None:
             return []
         neighbours = {k.keyframe_id for k in estimate.keyframes} | set(followed.fractions)
+        self._map.move([KeyframePose(i, T) for i, T in estimate.result.moved.items()])
         self._promotion.fuse(estimate)
         if followed.ok and not self._leaves_reference(followed):
             return []

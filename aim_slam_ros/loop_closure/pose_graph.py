@@ -146,6 +146,11 @@ class PoseGraph:
         own = self._component[keyframe_id]
         return self.within(keyframe_id, hops) | {k for k in recent if self._component[k] == own}
 
+    def is_long(self, edge: PoseEdge, gap: int) -> bool:
+        """Whether more keyframes than ``gap`` came between the ends: a loop in all but name."""
+        order = list(self._neighbours)
+        return abs(order.index(edge.a) - order.index(edge.b)) > gap
+
     def optimise(self) -> dict[int, Tensor]:
         """Batch Levenberg-Marquardt from the present poses; every T_world_kf [4,4] float64.
 

@@ -1,0 +1,17 @@
+"""What several test files share and is made once."""
+
+from __future__ import annotations
+
+import clip as clips
+import cv2
+import pytest
+import torch
+
+# Images are small: threads cost more than they bring, and results are the same for every count.
+torch.set_num_threads(1)
+cv2.setNumThreads(1)
+
+
+@pytest.fixture(scope='session')
+def clip(tmp_path_factory: pytest.TempPathFactory) -> clips.Clip:
+    return clips.make(tmp_path_factory.mktemp('rendered') / 'room')
