@@ -47,9 +47,9 @@ def test_the_prediction_is_left_as_it_was() -> None:
 
 def test_the_whole_pyramid_reaches_farther() -> None:
     image, uv = _texture(), _grid(60)
-    # coarse texture, or there is nothing to see in the upper levels
-    image = cv2.GaussianBlur(image, (0, 0), 6)
-    image = cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX)
+    # texture of every size, as the world has it, or there is nothing to see in the upper levels
+    blurred = [cv2.GaussianBlur(image.astype(np.float32), (0, 0), s) * s for s in (1, 4, 12, 24)]
+    image = cv2.normalize(np.sum(blurred, 0), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
     shift = np.array([38.0, 21.0], np.float32)
     moved = _shifted(image, shift)
 
@@ -73,8 +73,9 @@ def test_what_is_covered_does_not_flow_back() -> None:
     covered[:, 160:] = _texture(seed=1)[:, 160:]
     right = uv[:, 0] > 175
     checked = refine(image, covered, uv, uv).valid
-    assert checked[uv[:, 0] < 145].all() and checked[right].mean() < 0.1
-    assert refine(image, covered, uv, uv, max_round_trip_px=None).valid[right].mean() > 0.2
+    unchecked = refine(image, covered, uv, uv, max_round_trip_px=None).valid
+    assert checked[uv[:, 0] < 145].all()
+    assert checked[right].mean() < 0.2 < 0.6 < unchecked[right].mean()
 
 
 @pytest.mark.parametrize('where', [(np.nan, 5.0), (np.inf, 5.0), (-1.0, 5.0), (5.0, 240.0)])

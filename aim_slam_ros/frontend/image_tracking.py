@@ -40,12 +40,13 @@ class ImageTracker:
         matches, solution = self._refined(window, rigid_start)
         if solution is None or self._strays(rigid_start, solution, matches):
             return self._fallback(start, guess, matches)
-        T_world_cam = sim3.inverse(solution.T_cam_ref)
-        scale = self._scale(window, matches, solution)
+        scale = self._scale(window, matches, solution.T_cam_ref, solution.inliers)
         if not scale:
             return self._fallback(start, guess, matches)
-        return TrackingResult(True, sim3.with_scale(T_world_cam, scale), solution.kappa,
-                              matches.best_fraction(solution.inliers))
+        return TrackingResult(
+            True, sim3.with_scale(sim3.inverse(solution.T_cam_ref), scale), solution.kappa,
+            matches.best_fraction(solution.inliers),
+            measured=self._measured(window, matches, solution))
 
     def _refined(self, window: TrackingWindow,
                  T_world_cam: Tensor) -> tuple[PredictedMatches, RigidSolution | None]:
@@ -67,17 +68,33 @@ class ImageTracker:
         return moved > self._config.max_stray \
             or solution.inliers.sum() < self._config.min_matches
 
-    def _scale(self, window: TrackingWindow, matches: PredictedMatches,
-               solution: RigidSolution) -> float:
-        """From the prediction's unit to the world's, at the matched pixels; 0 where unknown."""
-        rows = solution.inliers
-        z = sim3.transform(solution.T_cam_ref, torch.from_numpy(matches.points_world[rows]))[:, 2]
+    def _scale(self, window: TrackingWindow, matches: PredictedMatches, T_cam_world: Tensor,
+               rows: np.ndarray) -> float:
+        """From the prediction's unit to the world's, at these matches; 0 where unknown."""
+        z = sim3.transform(T_cam_world, torch.from_numpy(matches.points_world[rows]))[:, 2]
         u, v = np.rint(matches.uv[rows]).astype(np.int64).T
         predicted = window.prediction.depth[0][v, u]
         weight = (window.prediction.confidence[0][v, u] - 1.0).clamp_min(0.0)
         ratio = log_depth_ratio(z, predicted,
                                 weight.sqrt() * torch.from_numpy(matches.weight[rows]))
         return ratio.scale if ratio.count else 0.0
+
+    def _measured(self, window: TrackingWindow, matches: PredictedMatches,
+                  joint: RigidSolution) -> dict[int, Tensor]:
+        """T_kf_frame of each keyframe that has matches enough for a solution of its own."""
+        measured = {}
+        for index, keyframe in enumerate(window.keyframes):
+            rows = np.flatnonzero((matches.owner == index) & joint.inliers)
+            if len(rows) < self._config.min_matches:
+                continue
+            alone = solve_rigid(matches.points_world[rows], matches.uv[rows],
+                                window.prediction.K[0], joint.T_cam_ref,
+                                matches.spread_world[rows], self._config.sigma_px, iterations=5)
+            scale = self._scale(window, matches, alone.T_cam_ref, rows)
+            if scale:
+                measured[keyframe.keyframe_id] = sim3.inverse(keyframe.T_world_kf) \
+                    @ sim3.with_scale(sim3.inverse(alone.T_cam_ref), scale)
+        return measured
 
     def _fallback(self, start: Tensor | None, guess: Tensor | None,
                   matches: PredictedMatches) -> TrackingResult:

@@ -93,7 +93,7 @@ class FrontendPipeline:
             return FrameResult(frame.stamp_ns, TrackingStatus.INITIALISING,
                                reason='waiting for parallax')
         keyframes = self._promotion.begin(beginning)
-        events = [self._promotion.event(k, [keyframes[0].keyframe_id]) for k in keyframes]
+        events = [self._promotion.event(k, {}, keyframes[0].keyframe_id) for k in keyframes]
         self._references.main_id = keyframes[0].keyframe_id
         late = self._place_waiting(keyframes, beginning, clock)
         self._references.main_id = keyframes[-1].keyframe_id
@@ -103,7 +103,7 @@ class FrontendPipeline:
     def _place_waiting(self, keyframes: Sequence[Keyframe], beginning: Beginning,
                        clock: Stopwatch) -> tuple[FrameResult, ...]:
         """The images that the map had to wait for, followed against it now."""
-        if not beginning.measured:
+        if not beginning.measured or len(keyframes) < 2:
             return ()
         first = keyframes[0].frame
         late = [self._tracked(first, sim3.rigid_part(keyframes[0].T_world_kf), ())]
@@ -177,7 +177,6 @@ class FrontendPipeline:
         """Fuse the window's keyframes and promote the image where it left its reference."""
         if encoding is None or estimate is None:
             return []
-        neighbours = {k.keyframe_id for k in estimate.keyframes} | set(followed.fractions)
         self._map.move([KeyframePose(i, T) for i, T in estimate.result.moved.items()])
         self._promotion.fuse(estimate)
         if followed.ok and not self._leaves_reference(followed):
@@ -186,8 +185,8 @@ class FrontendPipeline:
                                            self._intrinsics(encoding.frame))
         if keyframe is None:
             return []
-        self._references.main_id = keyframe.keyframe_id
-        return [self._promotion.event(keyframe, sorted(neighbours))]
+        before, self._references.main_id = self._references.main_id, keyframe.keyframe_id
+        return [self._promotion.event(keyframe, estimate.result.measured, before)]
 
     def _tracked(self, frame: Frame, T_world_cam: Tensor,
                  events: Sequence[KeyframeEvent]) -> FrameResult:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Sequence
+from typing import Mapping
 
 import numpy as np
 import torch
@@ -72,22 +72,27 @@ class Promotion:
             if unit.count and unit.spread < self._config.max_fuse_spread:
                 self._map.fuse(fused(keyframe, estimate.prediction, view, unit.scale))
 
-    def event(self, keyframe: Keyframe, neighbours: Sequence[int]) -> KeyframeEvent:
-        """What loop closure is told, with an edge to each neighbour."""
-        edges = tuple(_edge(self._map[i], keyframe) for i in neighbours
-                      if i != keyframe.keyframe_id)
+    def event(self, keyframe: Keyframe, measured: Mapping[int, Tensor],
+              reference_id: int) -> KeyframeEvent:
+        """What loop closure is told, with an edge for each measured T_older_keyframe.
+
+        Where nothing was measured, the edge to the reference is what the map has.
+        """
+        relative = dict(measured) or {
+            reference_id: sim3.inverse(self._map[reference_id].T_world_kf) @ keyframe.T_world_kf}
+        edges = tuple(_edge(self._map[i], keyframe.keyframe_id, T)
+                      for i, T in sorted(relative.items()) if i != keyframe.keyframe_id)
         return KeyframeEvent(
             keyframe.keyframe_id, keyframe.piece_id, keyframe.stamp_ns, keyframe.frame.image,
             keyframe.K, keyframe.points_cam, keyframe.confidence, keyframe.T_world_kf,
             keyframe.encoding.descriptor, edges, self._map.take_moved(keyframe.keyframe_id))
 
 
-def _edge(older: Keyframe, newer: Keyframe) -> PoseEdge:
+def _edge(older: Keyframe, newer_id: int, T_older_newer: Tensor) -> PoseEdge:
     depth = float(older.points_cam[::8, ::8, 2].median())
     sigma = torch.tensor(_EDGE_SIGMA, dtype=torch.float64)
     sigma[:3] *= depth
-    return PoseEdge(older.keyframe_id, newer.keyframe_id,
-                    sim3.inverse(older.T_world_kf) @ newer.T_world_kf, sigma)
+    return PoseEdge(older.keyframe_id, newer_id, T_older_newer, sigma)
 
 
 def _carried(frame: Frame, followed: Followed, K: Tensor) -> tuple[Tensor, Tensor]:

@@ -31,7 +31,8 @@ class TrackingResult:
     T_world_frame: [4,4] float64 Sim(3); it maps the current frame's predicted points, in the
     prediction's unit, to the world. kappa: reduced chi-square of the optimisation.
     matched_fraction: share of the current frame that a keyframe of the window sees too.
-    moved: new T_world_kf of the keyframes that moved. reason: why ``ok`` is false, for a person.
+    moved: new T_world_kf of the keyframes that moved. measured: T_kf_frame [4,4] Sim(3) as each
+    keyframe alone measures it, for the pose graph. reason: why ``ok`` is false, for a person.
     """
 
     ok: bool
@@ -39,6 +40,7 @@ class TrackingResult:
     kappa: float
     matched_fraction: float
     moved: dict[int, Tensor] = field(default_factory=dict)
+    measured: dict[int, Tensor] = field(default_factory=dict)
     reason: str = ''
 
 

@@ -58,12 +58,12 @@ class LoopClosurePipeline:
         if event.keyframe_id in self._graph:
             return None
         self._insert(event)
-        long_edges = self._add_edges(event)
+        self._add_edges(event)
         if not self._config.enabled:
             return None
-        candidates = self._retrieve(event, long_edges)
+        candidates = self._retrieve(event)
         loops = [loop for older in candidates if (loop := self._verify(event, older)) is not None]
-        self._close(loops, long_edges)
+        self._close(loops)
         return self._optimise() if loops else None
 
     @property
@@ -97,31 +97,25 @@ class LoopClosurePipeline:
                 self._graph.move(moved.keyframe_id, T_graph_frontend @ moved.T_world_kf)
         self._map.add(event)
 
-    def _add_edges(self, event: KeyframeEvent) -> list[PoseEdge]:
-        """Trust the frontend's edges, but give back the long ones: they may hide its drift.
+    def _add_edges(self, event: KeyframeEvent) -> None:
+        """The frontend's own measurements; one that spans a long time may be a false loop.
 
         Edges to keyframes that have not arrived (lost or late messages) wait for them.
         """
         edges, self._waiting = [*self._waiting, *event.edges], []
-        long_edges = []
         for edge in edges:
             if edge.a not in self._graph or edge.b not in self._graph:
                 self._waiting.append(edge)
-            elif self._config.enabled and self._graph.is_long(edge, self._config.min_gap):
-                long_edges.append(edge)
             else:
-                self._graph.add_edge(edge, robust=False)
-        return long_edges
+                self._graph.add_edge(edge, self._graph.is_long(edge, self._config.min_gap))
 
-    def _retrieve(self, event: KeyframeEvent, long_edges: list[PoseEdge]) -> list[int]:
-        """Keyframes to verify: what looks similar, and what the frontend saw again itself."""
+    def _retrieve(self, event: KeyframeEvent) -> list[int]:
+        """Keyframes that look similar but are not already linked."""
         self._events[event.keyframe_id] = event
         self._retrieval.add(event.keyframe_id, event.descriptor)
         similar = self._retrieval.candidates(event.keyframe_id, self._graph.neighbourhood(
             event.keyframe_id, self._config.covisible_hops, self._config.min_gap))
-        seen = [e.a for e in long_edges if e.b == event.keyframe_id and e.a in self._events]
-        ids = [*seen[:self._config.candidates], *(c.keyframe_id for c in similar)]
-        return list(dict.fromkeys(ids))
+        return [candidate.keyframe_id for candidate in similar]
 
     def _verify(self, newer: KeyframeEvent, older_id: int) -> AcceptedLoop | None:
         older = self._events[older_id]
@@ -139,13 +133,9 @@ class LoopClosurePipeline:
         pair = (newer.keyframe_id, older.keyframe_id)
         return [self._events[k] for k in dict.fromkeys(ids) if k not in pair]
 
-    def _close(self, loops: list[AcceptedLoop], long_edges: list[PoseEdge]) -> None:
-        """Add the loops, and the frontend's long edges where no loop says it better."""
-        verified = {(loop.older, loop.newer) for loop in loops}
-        edges = [PoseEdge(loop.older, loop.newer, loop.T_older_newer, loop.sigma)
-                 for loop in loops]
-        edges += [edge for edge in long_edges if (edge.a, edge.b) not in verified]
-        for edge in edges:
+    def _close(self, loops: list[AcceptedLoop]) -> None:
+        for loop in loops:
+            edge = PoseEdge(loop.older, loop.newer, loop.T_older_newer, loop.sigma)
             self._graph.add_edge(edge, robust=True)
         self._loops += loops
 

@@ -33,7 +33,9 @@ def detect(frame: Frame, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Keypoints [M,2] float32 in pixels of the frame and RootSIFT [M,128], at half resolution."""
     half = cv2.resize(frame.grey, (frame.width // 2, frame.height // 2),
                       interpolation=cv2.INTER_AREA)
-    keypoints, sift = cv2.SIFT_create(count, contrastThreshold=0.02).detectAndCompute(half, None)
+    # Without the precise upscale every keypoint is a quarter of a pixel off, to the lower right.
+    detector = cv2.SIFT_create(count, contrastThreshold=0.02, enable_precise_upscale=True)
+    keypoints, sift = detector.detectAndCompute(half, None)
     if sift is None:
         return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32)
     uv = cv2.KeyPoint_convert(keypoints)

@@ -59,22 +59,33 @@ class Matcher:
         return PairMatches(rows_a[good].numpy(), rows_b[good, 0].numpy())
 
 
-def essential_pose(uv_a: np.ndarray, uv_b: np.ndarray, K_a: Tensor,
-                   K_b: Tensor) -> tuple[Tensor, np.ndarray] | None:
+def essential_pose(uv_a: np.ndarray, uv_b: np.ndarray, K_a: Tensor, K_b: Tensor,
+                   seed: int) -> tuple[Tensor, np.ndarray] | None:
     """T_b_a [4,4] with a translation of unit length, and inliers [M] bool; None if there is none.
 
-    The essential matrix is found in a common camera with K_a.
+    The essential matrix is found in a common camera with K_a. seed: of the random sampling.
     """
     common = K_a.numpy()
     to_common = common @ np.linalg.inv(K_b.numpy())
-    uv_b = uv_b @ to_common[:2, :2].T + to_common[:2, 2]
-    E, mask = cv2.findEssentialMat(uv_a.astype(np.float64), uv_b.astype(np.float64), common,
-                                   method=cv2.USAC_MAGSAC, prob=0.999, threshold=1.0)
+    uv_a = np.ascontiguousarray(uv_a, np.float64)
+    uv_b = np.ascontiguousarray(uv_b @ to_common[:2, :2].T + to_common[:2, 2], np.float64)
+    undistorted = np.zeros(5)
+    E, mask = cv2.findEssentialMat(uv_a, uv_b, common, common, undistorted, undistorted,
+                                   _magsac(seed))
     if E is None or E.shape != (3, 3):
         return None
-    count, R, t, mask = cv2.recoverPose(E, uv_a.astype(np.float64), uv_b.astype(np.float64),
-                                        common, mask=mask)
+    count, R, t, mask = cv2.recoverPose(E, uv_a, uv_b, common, mask=mask)
     T = torch.eye(4, dtype=torch.float64)
     T[:3, :3] = torch.from_numpy(R)
     T[:3, 3] = torch.from_numpy(t[:, 0])
     return (T, mask[:, 0] > 0) if count > 0 else None
+
+
+def _magsac(seed: int) -> cv2.UsacParams:
+    """OpenCV's USAC_MAGSAC, with a seed."""
+    params = cv2.UsacParams()
+    params.confidence, params.threshold, params.maxIterations = 0.999, 1.0, 1000
+    params.score, params.sampler = cv2.SCORE_METHOD_MAGSAC, cv2.SAMPLING_UNIFORM
+    params.loMethod, params.loIterations, params.loSampleSize = cv2.LOCAL_OPTIM_SIGMA, 10, 50
+    params.randomGeneratorState = seed
+    return params

@@ -32,9 +32,10 @@ class ClassicalModel:
 
     min_views = 2
 
-    def __init__(self, config: ClassicalConfig, fov_deg: float) -> None:
+    def __init__(self, config: ClassicalConfig, fov_deg: float, seed: int = 0) -> None:
         self._config = config
         self._fov_deg = fov_deg
+        self._seed = seed
         self._uids = itertools.count()
         self._matcher = Matcher(config.ratio)
 
@@ -52,7 +53,8 @@ class ClassicalModel:
             raise ValueError('all views of a window must have the same size')
         K = [self._intrinsics(frame) for frame in frames]
         features = [e.features for e in encodings]
-        poses = window_poses(features, K, self._matcher, self._config, frames[0].width)
+        poses = window_poses(features, K, self._matcher, self._config, frames[0].width,
+                             self._seed)
         depth, confidence = self._dense(frames[0], features, K, poses)
         return WindowPrediction(depth, confidence, torch.stack(K), poses.T_first_view,
                                 poses.rotation_only)

@@ -66,8 +66,9 @@ class _Hypothesis:
 
 
 def window_poses(features: Sequence[ClassicalFeatures], K: Sequence[Tensor],
-                 matcher: Matcher, config: ClassicalConfig, width: int) -> WindowPoses:
-    """Relative poses of N views; see WindowPoses."""
+                 matcher: Matcher, config: ClassicalConfig, width: int,
+                 seed: int) -> WindowPoses:
+    """Relative poses of N views; see WindowPoses. seed: of the random sampling."""
     hub = _choose_hub(features, matcher, config)
     pairs = _pairs(hub, features, K, matcher, config)
     gate_px = config.rotation_gate_px * width / 518.0
@@ -75,7 +76,8 @@ def window_poses(features: Sequence[ClassicalFeatures], K: Sequence[Tensor],
     if not moving:
         return _rotations(hub, pairs, len(features))
     moving.sort(key=lambda p: -len(p.uv) * min(p.parallax_px, 4.0 * gate_px))
-    found = [h for seed in moving[:2] if (h := _hypothesis(seed, pairs, K, hub)) is not None]
+    found = [h for pair in moving[:2]
+             if (h := _hypothesis(pair, pairs, K, hub, seed)) is not None]
     if not found:
         return _rotations(hub, pairs, len(features))
     return _result(min(found, key=lambda h: h.cost), hub, pairs, features)
@@ -134,30 +136,30 @@ def _rotations(hub: int, pairs: list[_Pair], n: int) -> WindowPoses:
     return WindowPoses(T_view_hub[0] @ sim3.inverse(T_view_hub), connected, True, (empty,) * n)
 
 
-def _hypothesis(seed: _Pair, pairs: list[_Pair], K: Sequence[Tensor],
-                hub: int) -> _Hypothesis | None:
+def _hypothesis(first: _Pair, pairs: list[_Pair], K: Sequence[Tensor], hub: int,
+                seed: int) -> _Hypothesis | None:
     """Start from one pair's essential matrix, add the other views by PnP, adjust all."""
-    relative = essential_pose(seed.uv_hub, seed.uv, K[hub], K[seed.view])
+    relative = essential_pose(first.uv_hub, first.uv, K[hub], K[first.view], seed)
     if relative is None:
         return None
-    T_seed, inliers = relative[0].numpy(), relative[1]
-    rays = _rays(_normalised(seed.uv_hub, K[hub]))
-    rho = _triangulate(T_seed, rays, seed.xy)
+    T_first, inliers = relative[0].numpy(), relative[1]
+    rays = _rays(_normalised(first.uv_hub, K[hub]))
+    rho = _triangulate(T_first, rays, first.xy)
     usable = inliers & (rho > MIN_RHO)
     if usable.sum() < 12:
         return None
-    T_seed[:3, 3] *= np.median(rho[usable])
+    T_first[:3, 3] *= np.median(rho[usable])
     rho = np.clip(rho / np.median(rho[usable]), 0.05, 20.0)
-    start = dict(zip(seed.hub_rows[usable], np.flatnonzero(usable)))
-    poses, views = [T_seed], [seed.view]
+    start = dict(zip(first.hub_rows[usable], np.flatnonzero(usable)))
+    poses, views = [T_first], [first.view]
     for pair in pairs:
-        if pair.view == seed.view:
+        if pair.view == first.view:
             continue
         T = _resect(pair, start, rays, rho)
         if T is not None:
             poses.append(T)
             views.append(pair.view)
-    return _adjusted(np.stack(poses), views, pairs, seed, rho, usable, K, hub)
+    return _adjusted(np.stack(poses), views, pairs, first, rho, usable, K, hub)
 
 
 def _triangulate(T: np.ndarray, rays: np.ndarray, xy: np.ndarray) -> np.ndarray:
@@ -185,7 +187,7 @@ def _resect(pair: _Pair, start: dict[int, int], rays: np.ndarray,
     return T
 
 
-def _adjusted(poses: np.ndarray, views: list[int], pairs: list[_Pair], seed: _Pair,
+def _adjusted(poses: np.ndarray, views: list[int], pairs: list[_Pair], first: _Pair,
               rho: np.ndarray, usable: np.ndarray, K: Sequence[Tensor], hub: int) -> _Hypothesis:
     """Bundle adjustment over every match of the hub with the placed views."""
     placed = {view: slot for slot, view in enumerate(views)}
@@ -196,7 +198,7 @@ def _adjusted(poses: np.ndarray, views: list[int], pairs: list[_Pair], seed: _Pa
         at = np.searchsorted(hub_rows, pair.hub_rows)
         rays[at] = _rays(_normalised(pair.uv_hub, K[hub]))
     start = np.ones(len(hub_rows))
-    start[np.searchsorted(hub_rows, seed.hub_rows[usable])] = rho[usable]
+    start[np.searchsorted(hub_rows, first.hub_rows[usable])] = rho[usable]
     seen = Observations(
         np.concatenate([np.full(len(p.hub_rows), placed[p.view]) for p in used]),
         np.concatenate([np.searchsorted(hub_rows, p.hub_rows) for p in used]),
