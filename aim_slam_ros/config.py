@@ -127,7 +127,7 @@ class SigmaConfig(_Section):
         4, 'every so many pixels of a keyframe are indexed and ranked', 1, 64)
     candidates: int = _setting(10, 'keyframes kept by voxel overlap for the ranking', 1, 100)
     points: int = _setting(
-        2000, 'least confident points of the last keyframe that the gain is computed on', 10,
+        1000, 'least confident points of the last keyframe that the gain is computed on', 10,
         100000)
     sigma_px: float = _setting(1.0, 'noise of a pixel [px]', 0.01, 100)
     sigma_depth: float = _setting(

@@ -10,19 +10,17 @@ import torch
 from clip import Clip
 from torch import Tensor
 
-from aim_slam_ros.config import FollowingConfig, KeyframesConfig
+from aim_slam_ros.config import FollowingConfig
 from aim_slam_ros.frontend.following import Followed, Follower
 from aim_slam_ros.frontend.initialisation import Beginning
 from aim_slam_ros.frontend.keyframe_map import KeyframeMap
 from aim_slam_ros.frontend.landmarks import LandmarkCache
-from aim_slam_ros.frontend.promotion import Promotion
 from aim_slam_ros.frontend.tracking import TrackingResult
 from aim_slam_ros.frontend.window import WindowEstimate
 from aim_slam_ros.geometry import camera, sim3
 from aim_slam_ros.types import KeyframePose, WindowPrediction
 
 UNIT = 0.6      # metres per unit of the prediction
-CONFIG = KeyframesConfig()
 
 
 def _prediction(clip: Clip, indices: list[int], confidence: float = 6.0,
@@ -159,14 +157,23 @@ def test_fusing_uses_the_keyframe_as_it_is_now(clip: Clip) -> None:
 def test_an_event_tells_what_loop_closure_needs(clip: Clip) -> None:
     keyframes = clips.true_map(clip, [10, 13, 16], (1.0, 2.0, 0.5))
     keyframes.move([KeyframePose(0, keyframes[0].T_world_kf)])
-    event = Promotion(CONFIG, keyframes).event(keyframes[2], [0, 1, 2])
+    measured = {1: sim3.exp(torch.full((7,), 0.1, dtype=torch.float64)), 0: sim3.identity(),
+                2: sim3.identity()}
+    event = clips.promotion(keyframes).event(keyframes[2], measured, 0)
     assert (event.keyframe_id, event.stamp_ns) == (2, clip.stamps_ns[16])
     assert [(e.a, e.b) for e in event.edges] == [(0, 2), (1, 2)], 'no edge to itself'
     for edge in event.edges:
-        assert torch.allclose(keyframes[edge.a].T_world_kf @ edge.T_a_b, event.T_world_kf)
+        assert torch.equal(edge.T_a_b, measured[edge.a])
         assert edge.sigma.shape == (7,) and bool((edge.sigma > 0).all())
     assert [p.keyframe_id for p in event.moved] == [0]
     assert event.image.shape[:2] == event.confidence.shape == event.points_cam.shape[:2]
     # the same surety in metres, whatever the unit of keyframe a
     metres = [float(e.sigma[0] * sim3.scale_of(keyframes[e.a].T_world_kf)) for e in event.edges]
     assert math.isclose(metres[0], metres[1], rel_tol=0.2)
+
+
+def test_where_nothing_was_measured_the_map_gives_the_edge(clip: Clip) -> None:
+    keyframes = clips.true_map(clip, [10, 13], (1.0, 2.0))
+    edge, = clips.promotion(keyframes).event(keyframes[1], {}, 0).edges
+    assert torch.allclose(keyframes[0].T_world_kf @ edge.T_a_b, keyframes[1].T_world_kf)
+    assert clips.promotion(keyframes).event(keyframes[0], {}, 0).edges == ()

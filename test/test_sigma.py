@@ -45,7 +45,7 @@ def test_gain_is_that_of_the_kalman_update() -> None:
     last, other = _last(), _seen_at(1, 0.3, unit=0.6)
     config = replace(CONFIG, points=40, depth_tolerance=1.0)
     prior = sigma._uncertain_points(last, config)
-    view = sigma._seen_from(other, last, prior.points, config)
+    view = sigma._seen_from(other, last, prior, config)
     P, J, R = prior.covariance, view.J, view.R
     posterior = P - P @ J.mT @ torch.linalg.inv(R + J @ P @ J.mT) @ J @ P
     gain = 0.5 * torch.log(torch.linalg.det(P) / torch.linalg.det(posterior))

@@ -107,4 +107,4 @@ class ImageTracker:
 
 
 def _failed(reason: str) -> TrackingResult:
-    return TrackingResult(False, sim3.identity(), math.inf, 0.0, {}, reason)
+    return TrackingResult(False, sim3.identity(), math.inf, 0.0, reason=reason)

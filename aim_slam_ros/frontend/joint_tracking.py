@@ -179,4 +179,4 @@ def _check(window: TrackingWindow) -> None:
 
 
 def _failed(reason: str, share: float = 0.0) -> TrackingResult:
-    return TrackingResult(False, sim3.identity(), math.inf, share, {}, reason)
+    return TrackingResult(False, sim3.identity(), math.inf, share, reason=reason)

@@ -70,7 +70,7 @@ def rerank(last: Keyframe, candidates: Sequence[Keyframe], config: SigmaConfig,
     if not others:
         return []
     prior = _uncertain_points(last, config)
-    seen = [_seen_from(kf, last, prior.points, config) for kf in others]
+    seen = [_seen_from(kf, last, prior, config) for kf in others]
     J = torch.stack([view.J for view in seen])   # [C,N,3,3]
     R = torch.stack([view.R for view in seen])
     per_point = 0.5 * torch.log(_det(R + J @ prior.covariance @ J.mT) / _det(R))
@@ -116,10 +116,14 @@ def _kappa(attempt: Attempt) -> float:
 
 @dataclass(frozen=True)
 class _Uncertain:
-    """points: [N,3] float64 in the last keyframe, with their covariance [N,3,3]."""
+    """points: [N,3] float64 in the last keyframe, with their covariance [N,3,3].
+
+    typical: the confidence that one observation brings.
+    """
 
     points: Tensor
     covariance: Tensor
+    typical: float
 
 
 @dataclass(frozen=True)
@@ -141,13 +145,15 @@ def _uncertain_points(last: Keyframe, config: SigmaConfig) -> _Uncertain:
     count = min(config.points, len(points))
     confidence, least = torch.topk(confidence, count, largest=False)
     points = points[least]
-    return _Uncertain(points, _covariance(points, confidence, _typical(last), last.K, config))
+    typical = _typical(last)
+    return _Uncertain(points, _covariance(points, confidence, typical, last.K, config), typical)
 
 
-def _seen_from(candidate: Keyframe, last: Keyframe, points: Tensor, config: SigmaConfig) -> _Seen:
-    """Points [N,3] of the last keyframe, in the candidate's rays and its own depth there."""
+def _seen_from(candidate: Keyframe, last: Keyframe, prior: _Uncertain,
+               config: SigmaConfig) -> _Seen:
+    """The last keyframe's points, in the candidate's rays and its own depth there."""
     T = sim3.inverse(candidate.T_world_kf) @ last.T_world_kf
-    X = sim3.transform(T, points)
+    X = sim3.transform(T, prior.points)
     uv = camera.project(X, candidate.K)
     height, width = candidate.confidence.shape
     inside = camera.inside(uv, height, width)
@@ -158,7 +164,7 @@ def _seen_from(candidate: Keyframe, last: Keyframe, points: Tensor, config: Sigm
     same = torch.log(own[:, 2] / X[:, 2]).abs() < config.depth_tolerance
     visible = inside & same & (confidence > GUESSED_CONFIDENCE)
     to_ray = rays.ray_derivative(own)
-    noise = _covariance(own, confidence, _typical(last), candidate.K, config)
+    noise = _covariance(own, confidence, prior.typical, candidate.K, config)
     floor = config.sigma_ray ** 2 * torch.eye(3, dtype=X.dtype, device=X.device)
     # A ray has two degrees of freedom: the floor keeps R invertible along it.
     return _Seen(rays.ray_derivative(X) @ T[:3, :3].to(X), to_ray @ noise @ to_ray.mT + floor,
@@ -183,8 +189,8 @@ def _covariance(points: Tensor, confidence: Tensor, typical: float, K: Tensor,
 
 def _typical(keyframe: Keyframe) -> float:
     """The median confidence above 1 that one observation brought to the keyframe."""
-    seen = keyframe.confidence[torch.isfinite(keyframe.confidence)
-                               & (keyframe.confidence > GUESSED_CONFIDENCE)]
+    confidence = keyframe.confidence[::4, ::4]   # a median needs no more
+    seen = confidence[torch.isfinite(confidence) & (confidence > GUESSED_CONFIDENCE)]
     return float(seen.median() - 1.0) / keyframe.observations if len(seen) else 1.0
 
 

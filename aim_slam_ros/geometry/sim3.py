@@ -31,8 +31,8 @@ def from_parts(scale: Tensor | float, rotation: Tensor, translation: Tensor) -> 
 
 
 def scale_of(T: Tensor) -> Tensor:
-    """[...,4,4] to [...]: the scale, the cube root of the determinant of s R."""
-    return torch.linalg.det(T[..., :3, :3]).clamp_min(1e-300) ** (1.0 / 3.0)
+    """[...,4,4] to [...]: the scale; the rows of s R have length s."""
+    return (T[..., :3, :3].square().sum((-2, -1)) / 3.0).sqrt()
 
 
 def rotation_of(T: Tensor) -> Tensor:
@@ -57,7 +57,8 @@ def with_scale(T: Tensor, scale: Tensor | float) -> Tensor:
 
 def inverse(T: Tensor) -> Tensor:
     """[...,4,4] to [...,4,4]."""
-    A_inv = torch.linalg.inv(T[..., :3, :3])
+    A = T[..., :3, :3]
+    A_inv = A.mT / (A.square().sum((-2, -1), keepdim=True) / 3.0)   # (s R)^-1 = (s R)^T / s^2
     out = torch.zeros_like(T)
     out[..., :3, :3] = A_inv
     out[..., :3, 3] = -(A_inv @ T[..., :3, 3:])[..., 0]

@@ -33,7 +33,6 @@ class RigidSolution:
 @dataclass(frozen=True)
 class _Linearised:
     residual: np.ndarray      # [N,2] px
-    weight: np.ndarray        # [N,2,2] inverse covariance
     squared: np.ndarray       # [N] squared Mahalanobis distance
     H: np.ndarray
     g: np.ndarray
@@ -101,22 +100,28 @@ def _linearise(T: np.ndarray, X: np.ndarray, uv: np.ndarray, K: np.ndarray,
     residual = np.stack([fx * a + K[0, 2], fy * b + K[1, 2]], 1) - uv
     residual[~front] = _FAR_PX
     zero = np.zeros_like(a)
-    J = np.stack([
-        np.stack([fx / z, zero, -fx * a / z, -fx * a * b, fx * (1 + a * a), -fx * b], 1),
-        np.stack([zero, fy / z, -fy * b / z, -fy * (1 + b * b), fy * a * b, fy * a], 1)], 1)
-    weight = np.broadcast_to(np.eye(2) / sigma_px ** 2, (len(X), 2, 2))
+    J_u = np.stack([fx / z, zero, -fx * a / z, -fx * a * b, fx * (1 + a * a), -fx * b])
+    J_v = np.stack([zero, fy / z, -fy * b / z, -fy * (1 + b * b), fy * a * b, fy * a])
+    squared = (residual ** 2).sum(1) / sigma_px ** 2
+    terms = [(J_u, residual[:, 0], 1.0), (J_v, residual[:, 1], 1.0)]
     if spread is not None:
-        # Along e, the image of the depth error, the variance is sigma^2 + |e|^2.
-        e = np.einsum('nij,nj->ni', J[:, :, :3], spread @ T[:3, :3].T)
-        shrink = 1.0 / (sigma_px ** 2 + (e * e).sum(1))
-        weight = weight - shrink[:, None, None] * e[:, :, None] * e[:, None, :] / sigma_px ** 2
-    squared = np.einsum('ni,nij,nj->n', residual, weight, residual)
-    robust = np.where(front, 1.0 / (1.0 + squared / _CAUCHY), 0.0)
-    WJ = (weight * robust[:, None, None]) @ J
-    H = np.einsum('nij,nik->jk', J, WJ)
-    g = np.einsum('nij,ni->j', WJ, residual)
+        # Along e, the image of the depth error, the variance is sigma^2 + |e|^2: the information
+        # is (I - e e^T / (sigma^2 + |e|^2)) / sigma^2.
+        turned = spread @ T[:3, :3].T
+        e_u = J_u[0] * turned[:, 0] + J_u[2] * turned[:, 2]
+        e_v = J_v[1] * turned[:, 1] + J_v[2] * turned[:, 2]
+        shrink = 1.0 / (sigma_px ** 2 + e_u ** 2 + e_v ** 2)
+        along = e_u * residual[:, 0] + e_v * residual[:, 1]
+        squared = squared - shrink * along ** 2 / sigma_px ** 2
+        terms.append((e_u * J_u + e_v * J_v, along, -shrink))
+    robust = np.where(front, 1.0 / (1.0 + squared / _CAUCHY), 0.0) / sigma_px ** 2
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    for J, r, factor in terms:
+        WJ = J * (robust * factor)
+        H += WJ @ J.T
+        g += WJ @ r
     cost = _CAUCHY * float(np.log1p(squared / _CAUCHY).sum())
-    return _Linearised(residual, weight, squared, H, g, cost)
+    return _Linearised(residual, squared, H, g, cost)
 
 
 _CAUCHY = 2.0 ** 2      # squared distance, in sigmas, at which a residual counts half

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import os
+from concurrent.futures import ThreadPoolExecutor
 from typing import Sequence
 
 import cv2
@@ -38,6 +40,8 @@ class ClassicalModel:
         self._seed = seed
         self._uids = itertools.count()
         self._matcher = Matcher(config.ratio)
+        # OpenCV and numpy release the interpreter lock: the views are swept side by side.
+        self._workers = ThreadPoolExecutor(min(4, os.cpu_count() or 1))
 
     def encode(self, frame: Frame) -> FrameEncoding:
         uv, sift = detect(frame, self._config.features)
@@ -69,7 +73,8 @@ class ClassicalModel:
         """Depth and confidence, [N,H,W] float32 each."""
         h, w = features[0].small.shape
         K_small = [camera.scaled(k, w / frame.width, h / frame.height).numpy() for k in K]
-        swept = [self._sweep(i, features, K_small, poses) for i in range(len(features))]
+        swept = list(self._workers.map(
+            lambda i: self._sweep(i, features, K_small, poses), range(len(features))))
         depth, confidence = [], []
         for i, points in enumerate(poses.points):
             score = self._score(i, swept, K_small, poses)
