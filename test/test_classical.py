@@ -158,9 +158,9 @@ class TestBundle:
         return bundle.Bundle(poses.numpy(), points.numpy() / z[:, None], 1.0 / z), seen
 
     @staticmethod
-    def _wrong(truth: bundle.Bundle) -> bundle.Bundle:
+    def _wrong(truth: bundle.Bundle, error: float = 0.03) -> bundle.Bundle:
         rng = np.random.default_rng(1)
-        xi = torch.from_numpy(0.03 * rng.standard_normal((2, 7)))
+        xi = torch.from_numpy(error * rng.standard_normal((2, 7)))
         xi[:, 6] = 0.0
         poses = (sim3.exp(xi) @ torch.from_numpy(truth.T_view_hub)).numpy()
         return replace(truth, T_view_hub=poses,
@@ -194,7 +194,8 @@ class TestBundle:
 
     def test_it_never_makes_the_cost_larger(self) -> None:
         truth, seen = self._problem(0.5)
-        costs = [bundle.adjust(self._wrong(truth), seen, iterations=n).cost for n in range(12)]
+        start = self._wrong(truth, 0.3)
+        costs = [bundle.adjust(start, seen, iterations=n).cost for n in range(12)]
         assert (np.diff(costs) <= 0).all() and costs[-1] < 0.5 * costs[0]
 
     def test_without_parallax_the_depths_stay_finite(self) -> None:
@@ -252,6 +253,14 @@ class TestSweep:
         inner[8:-8, 20:-8] = True       # the left edge is outside the source
         assert np.median(error[inner]) < 0.02
         assert got.score[inner].mean() > 0.4 > 0.1 > got.score[8:-8, :6].mean()
+
+    def test_outside_a_source_nothing_matches(self) -> None:
+        """Dark parts must not match the black that lies beyond the source's border."""
+        reference, source, _ = self._views()
+        reference[:, :12] = 1 + reference[:, :12] // 30
+        got = sweep.sweep(reference, self.K, [sweep.Source(source, self.K, self.T)],
+                          (0.2, 1.0), 48)
+        assert got.score[8:-8, :6].mean() < 0.1
 
     def test_nothing_is_sure_without_texture(self) -> None:
         flat = np.full((60, 80), 128, np.uint8)
@@ -335,6 +344,14 @@ class TestModel:
         assert float(rotation.fit_rotation(R.T, truth.T).trace()) > 2.9
         assert math.degrees(math.acos(min(1.0, (float((R @ truth).trace()) - 1) / 2))) < 0.5
         assert float(got.T_first_cam[1, :3, 3].norm()) == 0.0
+
+    @pytest.mark.parametrize('gate_px, rotation_only', [(0.0, False), (100.0, True)])
+    def test_the_gate_is_a_parallax(self, clip: Clip, gate_px: float,
+                                    rotation_only: bool) -> None:
+        config = replace(CONFIG, rotation_gate_px=gate_px)
+        got = _infer([clip.frame(i) for i in (24, 19)], ClassicalModel(config, 62.7))
+        assert got.rotation_only == rotation_only
+        assert (got.seen_share(0) == 0.0) == rotation_only
 
     def test_standing_still_is_a_rotation_too(self, clip: Clip) -> None:
         got = _infer([clip.frame(5), replace(clip.frame(5), stamp_ns=9)])

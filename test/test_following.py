@@ -117,6 +117,23 @@ def test_half_of_a_wrong_map_is_outvoted(clip: Clip) -> None:
     assert not got.ok or min(got.fractions.values()) < 0.5 * max(got.fractions.values())
 
 
+def test_ten_per_cent_of_depth_noise_in_a_far_away_world(clip: Clip) -> None:
+    """It is along the keyframe's rays, wherever the world's origin is."""
+    keyframe = clips.true_map(clip, [10])[0]
+    rng = torch.Generator().manual_seed(0)
+    noise = torch.exp(0.1 * torch.randn(keyframe.points_cam.shape[:2], generator=rng))
+    away = sim3.identity()
+    away[:3, 3] = torch.tensor([30.0, -20.0, 10.0])
+    noisy = replace(keyframe, points_cam=keyframe.points_cam * noise[..., None],
+                    T_world_kf=away @ keyframe.T_world_kf)
+    got = _follow(clip, [noisy], 12, away @ clip.T_world_cam[10],
+                  replace(CONFIG, sigma_depth=0.1))
+    rotation, position = _error(got.T_world_cam, away @ clip.T_world_cam[12])
+    assert got.ok and got.matched_fraction > 0.6
+    # noisy depths pull the camera towards the keyframe: 3 cm of the 17 cm between them
+    assert rotation < 0.8 and position < 0.045
+
+
 def test_landmarks_are_corners_of_what_was_seen(clip: Clip) -> None:
     keyframe = clips.true_map(clip, [10])[0]
     confidence = keyframe.confidence.clone()

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any, Sequence
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ..config import Config
@@ -186,7 +187,10 @@ class FrontendPipeline:
         if keyframe is None:
             return []
         before, self._references.main_id = self._references.main_id, keyframe.keyframe_id
-        return [self._promotion.event(keyframe, estimate.result.measured, before)]
+        # What was measured is in the inference's unit; a carried pointmap is in the world's.
+        own = torch.equal(keyframe.T_world_kf, estimate.result.T_world_frame)
+        measured = estimate.result.measured if own else {}
+        return [self._promotion.event(keyframe, measured, before)]
 
     def _tracked(self, frame: Frame, T_world_cam: Tensor,
                  events: Sequence[KeyframeEvent]) -> FrameResult:

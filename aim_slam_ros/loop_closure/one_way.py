@@ -10,18 +10,18 @@ import torch
 from torch import Tensor
 
 from ..geometry import camera, sim3
-from ..registration.flow import refine
+from ..registration.flow import LEVELS, TIGHT_LEVELS, refine
 from ..registration.rigid import solve_rigid
 from ..registration.scale import ScaleEstimate, log_depth_ratio
 from ..types import KeyframeEvent
 
-_STEP = 6               # px between sampled points
+_STEP = 8               # px between sampled points
 _PATCH = 15             # px, window of texture and similarity
 _MIN_TEXTURE = 4.0      # grey levels of standard deviation; flatter patches match anything
 _MIN_SIMILARITY = 0.6   # normalised cross-correlation of a patch that shows the same
 _MIN_POINTS = 40
 _DEPTH_ERROR = 0.05     # relative, of stored points, along their rays
-_REACH_PX = (30.0, 10.0)    # how far from its prediction a match is looked for, round by round
+_ROUNDS = ((30.0, LEVELS), (10.0, TIGHT_LEVELS))    # reach [px] and pyramid levels of a match
 
 
 @dataclass(frozen=True)
@@ -78,10 +78,10 @@ def register(reference: View, target: View, T_target_ref_guess: Tensor) -> OneWa
     T = sim3.rigid_part(T_target_ref_guess)
     uv_ref = reference.samples
     points = reference.points[uv_ref[:, 1], uv_ref[:, 0]].double().numpy()
-    for reach_px in _REACH_PX:
+    for reach_px, levels in _ROUNDS:
         if len(points) < _MIN_POINTS:
             return None
-        uv_target, valid = _match(reference, target, T, reach_px)
+        uv_target, valid = _match(reference, target, T, reach_px, levels)
         if valid.sum() < _MIN_POINTS:
             return None
         solution = solve_rigid(points[valid], uv_target[valid], target.K, T,
@@ -117,13 +117,13 @@ def _predict(reference: View, K: Tensor, T_target_ref: Tensor) -> np.ndarray:
     return uv.nan_to_num(-1.0, -1.0, -1.0).clamp(-1e4, 1e4).numpy()
 
 
-def _match(reference: View, target: View, T_target_ref: Tensor,
-           reach_px: float) -> tuple[np.ndarray, np.ndarray]:
+def _match(reference: View, target: View, T_target_ref: Tensor, reach_px: float,
+           levels: int) -> tuple[np.ndarray, np.ndarray]:
     """The reference's samples in the target: uv [N,2] float32 and valid [N] bool."""
     predicted = _predict(reference, target.K, T_target_ref)
     warped = _look_up(target.grey, predicted)
     uv_ref = reference.samples.astype(np.float32)
-    flow = refine(reference.grey, warped, uv_ref, uv_ref, max_move_px=reach_px)
+    flow = refine(reference.grey, warped, uv_ref, uv_ref, reach_px, levels=levels)
     # The flow ends in the warped image; the prediction there says where that is in the target.
     uv = _look_up(predicted, flow.uv_b[:, None])[:, 0]
     height, width = target.grey.shape

@@ -127,11 +127,11 @@ class LoopClosurePipeline:
                             found.sigma, found.matched_fraction, found.kappa)
 
     def _companions(self, newer: KeyframeEvent, older: KeyframeEvent) -> list[KeyframeEvent]:
-        """The best neighbour of each, for parallax in the model's window."""
-        ids = [*self._graph.neighbours(older.keyframe_id)[:1],
-               *self._graph.neighbours(newer.keyframe_id)[:1]]
+        """The nearest linked keyframe of each, for parallax in the model's window."""
         pair = (newer.keyframe_id, older.keyframe_id)
-        return [self._events[k] for k in dict.fromkeys(ids) if k not in pair]
+        nearest = [min((k for k in self._graph.neighbours(own) if k not in pair), default=None,
+                       key=lambda k: abs(k - own)) for own in reversed(pair)]
+        return [self._events[k] for k in dict.fromkeys(nearest) if k is not None]
 
     def _close(self, loops: list[AcceptedLoop]) -> None:
         for loop in loops:
