@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import re
 from dataclasses import dataclass, field
 from typing import Any, Mapping, TypeVar
 
@@ -21,10 +22,11 @@ class ConfigError(ValueError):
 
 
 def _setting(default: T, doc: str, low: float | None = None, high: float | None = None,
-             choices: tuple[str, ...] | None = None) -> T:
+             choices: tuple[str, ...] | None = None, multiple_of: int = 1) -> T:
     """A dataclass field with its documentation and its allowed values."""
     return field(default=default,
-                 metadata={'doc': doc, 'low': low, 'high': high, 'choices': choices})
+                 metadata={'doc': doc, 'low': low, 'high': high, 'choices': choices,
+                           'multiple_of': multiple_of})
 
 
 def allowed(spec: dataclasses.Field[Any]) -> str:
@@ -35,6 +37,8 @@ def allowed(spec: dataclasses.Field[Any]) -> str:
     if isinstance(spec.default, bool):
         return 'true or false'
     kind = {int: 'a whole number', float: 'a number'}.get(type(spec.default), 'text')
+    if spec.metadata['multiple_of'] > 1:
+        kind = f'a multiple of {spec.metadata["multiple_of"]}'
     if low is not None and high is not None:
         return f'{kind} from {low} to {high}'
     if low is not None:
@@ -58,6 +62,8 @@ def _checked(name: str, spec: dataclasses.Field[Any], value: Any) -> Any:
             raise refusal
     if spec.metadata['choices'] and value not in spec.metadata['choices']:
         raise refusal
+    if kind is int and value % spec.metadata['multiple_of']:
+        raise refusal
     return value
 
 
@@ -78,14 +84,15 @@ class _Section:
 
     def __post_init__(self) -> None:
         for spec in dataclasses.fields(self):  # type: ignore[arg-type]
-            name = f'{type(self).__name__.removesuffix("Config").lower()}.{spec.name}'
+            words = re.findall('[A-Z][a-z]*', type(self).__name__.removesuffix('Config'))
+            name = f'{"_".join(words).lower()}.{spec.name}'
             object.__setattr__(self, spec.name, _checked(name, spec, getattr(self, spec.name)))
 
 
 @dataclass(frozen=True)
 class CameraConfig(_Section):
     width: int = _setting(
-        518, 'width of the image the model sees [px], a multiple of 14', 84, 1036)
+        518, 'width of the image the model sees [px]', 84, 1036, multiple_of=14)
     use_calibration: bool = _setting(
         False, "take the dataset's or camera_info's intrinsics instead of estimating them")
     fov_deg: float = _setting(

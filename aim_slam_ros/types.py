@@ -157,10 +157,15 @@ class KeyframeEvent:
 
 @dataclass(frozen=True)
 class CorrectedKeyframes:
-    """All keyframe poses after a pose-graph optimisation; version counts up from 1."""
+    """All keyframe poses after a pose-graph optimisation; version counts up from 1.
+
+    pieces: the map piece of every keyframe; a loop between two pieces makes the newer one part of
+    the older.
+    """
 
     version: int
     poses: tuple[KeyframePose, ...]
+    pieces: Mapping[int, int] = field(default_factory=dict)
 
 
 class TrackingStatus(Enum):

@@ -46,7 +46,7 @@ class NoTracker:
 def _beginner(model: GeometryModel | None = None,
               **values: object) -> tuple[Initialisation, WindowTracker]:
     config = clips.config(**values)
-    window = WindowTracker(config.sigma, model or make_model(config), NoTracker())  # type: ignore
+    window = WindowTracker(config, model or make_model(config), NoTracker())  # type: ignore
     return Initialisation(config.initialisation, config.camera, window,
                           config.keyframes.min_confident), window
 

@@ -138,3 +138,24 @@ def test_a_correction_of_another_piece_leaves_this_one() -> None:
     assert torch.equal(keyframes[new.keyframe_id].T_world_kf, new.T_world_kf)
     keyframes.correct(_correction((new.keyframe_id, MOVE)))
     assert torch.equal(keyframes[new.keyframe_id].T_world_kf, MOVE)
+
+
+def test_a_loop_between_pieces_makes_them_one() -> None:
+    """The older piece is overlapped and searched again from the newer, in the older's unit."""
+    keyframes = _walk(3)
+    keyframes.begin_piece()
+    T_old_new = sim3.exp(torch.tensor([1.0, 0.0, 0.5, 0.0, 0.2, 0.0, 1.1], dtype=torch.float64))
+    true = [k.T_world_kf for k in keyframes.all]
+    for k, T in enumerate(box_room.trajectory(3)[1:]):
+        again = _add(keyframes, T, 4 + k, 0.9 + 0.2 * k)
+        keyframes.move([KeyframePose(again.keyframe_id, sim3.inverse(T_old_new) @ true[k + 1])])
+    joined = CorrectedKeyframes(
+        1, tuple(KeyframePose(i, T) for i, T in enumerate([*true, *true[1:]])),
+        {i: 0 for i in range(5)})
+    keyframes.correct(joined)
+    assert keyframes.piece_id == 0 and len(keyframes.piece) == 5
+    assert {1, 2} < {k.keyframe_id for k in keyframes.overlapping(3)}
+    later = _add(keyframes, box_room.trajectory(3)[2], 7)
+    assert later.piece_id == 0
+    keyframes.begin_piece()
+    assert keyframes.piece_id == 2, 'the number of a joined piece is not used again'

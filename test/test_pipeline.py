@@ -244,12 +244,12 @@ class TestLoss:
     def test_unrelated_images_lose_it_and_the_scene_finds_it(self, clip: Clip,
                                                              run: list[FrameResult]) -> None:
         pipeline = _pipeline()
-        _feed(pipeline, clip, range(BEGUN))
-        lost = self._noise(pipeline, clip, 5, clip.stamps_ns[BEGUN - 1])
+        _feed(pipeline, clip, range(36))
+        lost = self._noise(pipeline, clip, 5, clip.stamps_ns[35])
         _sane(lost)
         assert [r.status for r in lost] == [LOST] * 5
         assert all(not r.events for r in lost), 'nothing of it enters the map'
-        # back in view, but not where it was lost
+        # back in view, but far from where it was lost
         later = lost[-1].stamp_ns - clip.stamps_ns[8]
         found = _feed(pipeline, clip, range(9, 14), later)
         _sane(found)

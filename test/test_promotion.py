@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import clip as clips
 import pytest
@@ -124,7 +125,7 @@ def test_nothing_known_makes_no_keyframe(clip: Clip) -> None:
 def test_observations_are_fused_in_the_keyframes_unit(clip: Clip) -> None:
     keyframes = clips.true_map(clip, [10], (2.0,))
     before = keyframes[0]
-    clips.promotion(keyframes).fuse(
+    clips.promotion(keyframes).learn(
         _estimate(clip, keyframes, 12, _prediction(clip, [12, 10])))
     after = keyframes[0]
     assert after.observations == 2
@@ -137,10 +138,10 @@ def test_what_does_not_agree_is_not_fused(clip: Clip) -> None:
     keyframes = clips.true_map(clip, [10])
     prediction = _prediction(clip, [12, 10])
     prediction.depth[1] = prediction.depth[1].flip(0, 1) ** 2
-    clips.promotion(keyframes).fuse(_estimate(clip, keyframes, 12, prediction))
+    clips.promotion(keyframes).learn(_estimate(clip, keyframes, 12, prediction))
     assert keyframes[0].observations == 1
     unsure = _prediction(clip, [12, 10], 1.001)
-    clips.promotion(keyframes).fuse(_estimate(clip, keyframes, 12, unsure))
+    clips.promotion(keyframes).learn(_estimate(clip, keyframes, 12, unsure))
     assert keyframes[0].observations == 1
 
 
@@ -150,8 +151,17 @@ def test_fusing_uses_the_keyframe_as_it_is_now(clip: Clip) -> None:
     estimate = _estimate(clip, keyframes, 12, _prediction(clip, [12, 10]))
     moved = clip.T_world_cam[3]
     keyframes.move([KeyframePose(0, moved)])
-    clips.promotion(keyframes).fuse(estimate)
+    clips.promotion(keyframes).learn(estimate)
     assert torch.equal(keyframes[0].T_world_kf, moved) and keyframes[0].observations == 2
+
+
+def test_keyframes_go_where_the_tracker_put_them(clip: Clip) -> None:
+    keyframes = clips.true_map(clip, [10, 14])
+    estimate = _estimate(clip, keyframes, 12, _prediction(clip, [12, 10, 14]))
+    moved = replace(estimate.result, moved={1: clip.T_world_cam[15]})
+    clips.promotion(keyframes).learn(replace(estimate, result=moved))
+    assert torch.equal(keyframes[1].T_world_kf, clip.T_world_cam[15])
+    assert [p.keyframe_id for p in keyframes.take_moved(0)] == [1], 'and loop closure is told'
 
 
 def test_an_event_tells_what_loop_closure_needs(clip: Clip) -> None:

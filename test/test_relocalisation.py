@@ -32,7 +32,7 @@ def _parts(clip: Clip, config: Config) -> tuple[KeyframeMap, Relocalisation, Win
         keyframes.add(model.encode(made.frame), made.K, made.points_cam, made.confidence,
                       made.T_world_kf)
     follower = Follower(config.following, LandmarkCache(config.following))
-    window = WindowTracker(config.sigma, model, ImageTracker(
+    window = WindowTracker(config, model, ImageTracker(
         config.tracking, config.following, config.keyframes.min_confident))
     return keyframes, Relocalisation(config, keyframes, follower, window), window
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ..config import KeyframesConfig
 from ..geometry import camera, sim3
 from ..registration.scale import ScaleEstimate, log_depth_ratio
 from ..types import Keyframe, WindowPrediction
@@ -42,6 +43,17 @@ def pose_mean(window: TrackingWindow, min_seen: float) -> Tensor | None:
     if not guesses:
         return None
     return sim3.mean(torch.stack(guesses), torch.tensor(weights, dtype=torch.float64))
+
+
+def observed(keyframe: Keyframe, prediction: WindowPrediction, view: int,
+             config: KeyframesConfig) -> Keyframe:
+    """The keyframe with the prediction fused in, or as it was where they do not fit together."""
+    if prediction.seen_share(view) < config.min_confident:
+        return keyframe
+    unit = unit_of(keyframe, prediction, view)
+    if not unit.count or unit.spread > config.max_fuse_spread:
+        return keyframe
+    return fused(keyframe, prediction, view, unit.scale)
 
 
 def fused(keyframe: Keyframe, prediction: WindowPrediction, view: int, scale: float) -> Keyframe:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Sequence
+from typing import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -26,7 +26,7 @@ class KeyframeMap:
         self._piece_ids: list[int] = []
         self._moved: set[int] = set()
         self._descriptors: list[Tensor] = []
-        self.piece_id = 0
+        self.piece_id = self._pieces_begun = 0
         self._index: VoxelIndex | None = None
 
     def __getitem__(self, keyframe_id: int) -> Keyframe:
@@ -49,7 +49,7 @@ class KeyframeMap:
 
     def begin_piece(self) -> None:
         """Start a new, unconnected map; the first piece needs no call."""
-        self.piece_id += 1
+        self.piece_id = self._pieces_begun = self._pieces_begun + 1
         self._piece_ids = []
         self._index = None
 
@@ -71,40 +71,63 @@ class KeyframeMap:
         self._keyframes[keyframe.keyframe_id] = keyframe
 
     def move(self, poses: Sequence[KeyframePose]) -> None:
-        """New poses T_world_kf for keyframes of this map."""
-        for pose in poses:
-            old = self._keyframes[pose.keyframe_id]
-            keyframe = replace(old, T_world_kf=pose.T_world_kf)
-            self._keyframes[pose.keyframe_id] = keyframe
-            self._moved.add(pose.keyframe_id)
-            if keyframe.piece_id == self.piece_id and _displacement(old, keyframe) > _MOVED:
-                self._reindex(keyframe)
-
-    def _reindex(self, keyframe: Keyframe) -> None:
-        if self._index is not None:
-            self._index.move(keyframe.keyframe_id, confident_points(keyframe, self._config))
+        """New poses T_world_kf found by tracking; they are told with the next event."""
+        self._place(poses)
+        self._moved.update(pose.keyframe_id for pose in poses)
 
     def take_moved(self, except_id: int) -> tuple[KeyframePose, ...]:
-        """What moved since the last call."""
+        """What tracking moved since the last call."""
         moved = sorted(self._moved - {except_id})
         self._moved.clear()
         return tuple(KeyframePose(i, self._keyframes[i].T_world_kf) for i in moved)
 
     def correct(self, corrected: CorrectedKeyframes) -> None:
-        """Take the poses of a pose-graph optimisation.
+        """Take the poses of a pose-graph optimisation, and the pieces that it joined.
 
-        The current piece's keyframes that are newer than it move along with the newest one that
-        it knows of this piece.
+        Keyframes of the current piece that it does not know yet move along with the newest one
+        that it knows.
         """
-        known = {pose.keyframe_id: pose.T_world_kf for pose in corrected.poses
-                 if pose.keyframe_id in self._keyframes}
-        poses = [KeyframePose(i, T) for i, T in known.items()]
-        newest = max((i for i in self._piece_ids if i in known), default=None)
-        if newest is not None:
-            T_new_old = known[newest] @ sim3.inverse(self._keyframes[newest].T_world_kf)
+        poses = [p for p in corrected.poses if p.keyframe_id in self._keyframes]
+        known = {pose.keyframe_id: pose.T_world_kf for pose in poses}
+        anchor = max((i for i in self._piece_ids if i in known), default=None)
+        if anchor is not None:
+            T_new_old = known[anchor] @ sim3.inverse(self._keyframes[anchor].T_world_kf)
             poses += [KeyframePose(i, T_new_old @ self._keyframes[i].T_world_kf)
-                      for i in self._piece_ids if i > newest]
-        self.move(poses)
+                      for i in self._piece_ids if i not in known]
+        self._place(poses)
+        self._join(corrected.pieces, anchor)
+
+    def _place(self, poses: Sequence[KeyframePose]) -> None:
+        for pose in poses:
+            old = self._keyframes[pose.keyframe_id]
+            keyframe = replace(old, T_world_kf=pose.T_world_kf)
+            self._keyframes[pose.keyframe_id] = keyframe
+            if self._index is not None and pose.keyframe_id in self._index \
+                    and _displacement(old, keyframe) > _MOVED:
+                self._index.move(pose.keyframe_id, confident_points(keyframe, self._config))
+
+    def _join(self, pieces: Mapping[int, int], anchor: int | None) -> None:
+        """Take over which piece each keyframe is in; the current piece may have become older."""
+        if anchor is not None and anchor in pieces:
+            current = pieces[anchor]
+            pieces = {i: current for i in self._piece_ids} | dict(pieces)
+            self.piece_id = current
+        for i, piece_id in pieces.items():
+            if i in self._keyframes and self._keyframes[i].piece_id != piece_id:
+                self._keyframes[i] = replace(self._keyframes[i], piece_id=piece_id)
+        if anchor is None:
+            return
+        ids = [i for i, k in self._keyframes.items() if k.piece_id == self.piece_id]
+        if ids != self._piece_ids:
+            self._piece_ids = ids
+            self._reindex()
+
+    def _reindex(self) -> None:
+        """Anew, since the joined piece may have a unit of its own."""
+        first = self._keyframes[self._piece_ids[0]]
+        self._index = VoxelIndex(relative_voxel_size(first, self._config))
+        for keyframe in self.piece:
+            self._index.insert(keyframe.keyframe_id, confident_points(keyframe, self._config))
 
     def overlapping(self, keyframe_id: int) -> tuple[Keyframe, ...]:
         """The piece's other keyframes by shared voxels, most first (paper, SIGMA a)."""

@@ -14,7 +14,7 @@ from ..config import Config
 from ..geometry import sim3
 from ..models.base import GeometryModel
 from ..types import (CorrectedKeyframes, Frame, FrameEncoding, FrameResult, Keyframe,
-                     KeyframeEvent, KeyframePose, TrackingStatus)
+                     KeyframeEvent, TrackingStatus)
 from .admission import Admission
 from .following import Followed, Follower
 from .image_tracking import ImageTracker
@@ -40,7 +40,7 @@ class FrontendPipeline:
         self._admission = Admission(config.camera)
         self._follower = Follower(config.following, LandmarkCache(config.following))
         self._references = References(config, self._map, self._follower)
-        self._window = WindowTracker(config.sigma, model, _tracker(config))
+        self._window = WindowTracker(config, model, _tracker(config))
         self._relocalisation = Relocalisation(config, self._map, self._follower, self._window)
         self._promotion = Promotion(config.keyframes, self._map)
         self._start()
@@ -178,8 +178,7 @@ class FrontendPipeline:
         """Fuse the window's keyframes and promote the image where it left its reference."""
         if encoding is None or estimate is None:
             return []
-        self._map.move([KeyframePose(i, T) for i, T in estimate.result.moved.items()])
-        self._promotion.fuse(estimate)
+        self._promotion.learn(estimate)
         if followed.ok and not self._leaves_reference(followed):
             return []
         keyframe = self._promotion.promote(encoding, followed, estimate,

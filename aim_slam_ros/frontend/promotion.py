@@ -11,9 +11,9 @@ from torch import Tensor
 
 from ..config import KeyframesConfig
 from ..geometry import camera, sim3
-from ..types import (Frame, FrameEncoding, Keyframe, KeyframeEvent, PoseEdge,
-                     WindowPrediction)
-from .alignment import fused, unit_of
+from ..types import (Frame, FrameEncoding, Keyframe, KeyframeEvent, KeyframePose,
+                     PoseEdge, WindowPrediction)
+from .alignment import observed
 from .following import Followed
 from .initialisation import Beginning
 from .keyframe_map import KeyframeMap
@@ -62,15 +62,12 @@ class Promotion:
         return self._map.add(encoding, prediction.K[view], points, prediction.confidence[view],
                              T_world_kf)
 
-    def fuse(self, estimate: WindowEstimate) -> None:
-        """Average the window's new depths into its keyframes, each in its own unit."""
+    def learn(self, estimate: WindowEstimate) -> None:
+        """Move the window's keyframes where the tracker put them and fuse their new depths."""
+        self._map.move([KeyframePose(i, T) for i, T in estimate.result.moved.items()])
         for view, keyframe in enumerate(estimate.keyframes, 1):
-            if estimate.prediction.seen_share(view) < self._config.min_confident:
-                continue
-            keyframe = self._map[keyframe.keyframe_id]
-            unit = unit_of(keyframe, estimate.prediction, view)
-            if unit.count and unit.spread < self._config.max_fuse_spread:
-                self._map.fuse(fused(keyframe, estimate.prediction, view, unit.scale))
+            self._map.fuse(observed(self._map[keyframe.keyframe_id], estimate.prediction, view,
+                                    self._config))
 
     def event(self, keyframe: Keyframe, measured: Mapping[int, Tensor],
               reference_id: int) -> KeyframeEvent:

@@ -7,9 +7,10 @@ from typing import Sequence
 
 from torch import Tensor
 
-from ..config import SigmaConfig
+from ..config import Config
 from ..models.base import GeometryModel
 from ..types import Frame, FrameEncoding, Keyframe, WindowPrediction
+from .alignment import observed
 from .keyframe_map import KeyframeMap
 from .sigma import activate, rerank
 from .stages import Stopwatch
@@ -39,8 +40,9 @@ class WindowTracker:
     The only place that asks the model, so that every inference is counted.
     """
 
-    def __init__(self, config: SigmaConfig, model: GeometryModel, tracker: Tracker) -> None:
-        self._config = config
+    def __init__(self, config: Config, model: GeometryModel, tracker: Tracker) -> None:
+        self._config = config.sigma
+        self._fusion = config.keyframes
         self._model = model
         self._tracker = tracker
         self.inferences = 0
@@ -71,9 +73,15 @@ class WindowTracker:
         return activate(
             reference_id, [r.keyframe_id for r in ranked],
             lambda ids: self.estimate(encoding, guess, [keyframes[i] for i in ids], clock),
-            lambda _, ids: [r.keyframe_id for r in rerank(
-                reference, [keyframes[i] for i in ids], self._config)],
+            lambda estimate, ids: self._reorder(estimate, [keyframes[i] for i in ids], clock),
             self._config).attempt
+
+    def _reorder(self, estimate: WindowEstimate, remaining: Sequence[Keyframe],
+                 clock: Stopwatch) -> list[int]:
+        """The remaining candidates ranked again, the reference as this estimate would leave it."""
+        with clock.stage('prioritise'):
+            reference = observed(estimate.keyframes[0], estimate.prediction, 1, self._fusion)
+            return [r.keyframe_id for r in rerank(reference, remaining, self._config)]
 
     def estimate(self, encoding: FrameEncoding, guess: Tensor | None,
                  keyframes: Sequence[Keyframe], clock: Stopwatch) -> WindowEstimate:

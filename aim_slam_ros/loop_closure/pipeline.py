@@ -50,7 +50,7 @@ class LoopClosurePipeline:
         self._version = 0
 
     def add(self, event: KeyframeEvent) -> CorrectedKeyframes | None:
-        """Take a keyframe in; all corrected poses if it closed a loop, else None.
+        """Take a keyframe in; all corrected poses if it saw an old place again, else None.
 
         A keyframe that is known already (the frontend was asked to resend) changes nothing.
         Raises PoseGraphError or RetrievalError for an event with unusable numbers.
@@ -58,13 +58,13 @@ class LoopClosurePipeline:
         if event.keyframe_id in self._graph:
             return None
         self._insert(event)
-        self._add_edges(event)
+        again = self._add_edges(event)
         if not self._config.enabled:
             return None
         candidates = self._retrieve(event)
         loops = [loop for older in candidates if (loop := self._verify(event, older)) is not None]
         self._close(loops)
-        return self._optimise() if loops else None
+        return self._optimise() if loops or again else None
 
     @property
     def loops(self) -> tuple[AcceptedLoop, ...]:
@@ -97,17 +97,22 @@ class LoopClosurePipeline:
                 self._graph.move(moved.keyframe_id, T_graph_frontend @ moved.T_world_kf)
         self._map.add(event)
 
-    def _add_edges(self, event: KeyframeEvent) -> None:
-        """The frontend's own measurements; one that spans a long time may be a false loop.
+    def _add_edges(self, event: KeyframeEvent) -> bool:
+        """The frontend's own measurements; whether one of them spans a long time.
 
-        Edges to keyframes that have not arrived (lost or late messages) wait for them.
+        Such an edge closes a loop, and like one it may be false. Edges to keyframes that have not
+        arrived (lost or late messages) wait for them.
         """
         edges, self._waiting = [*self._waiting, *event.edges], []
+        again = False
         for edge in edges:
             if edge.a not in self._graph or edge.b not in self._graph:
                 self._waiting.append(edge)
             else:
-                self._graph.add_edge(edge, self._graph.is_long(edge, self._config.min_gap))
+                long = self._graph.is_long(edge, self._config.min_gap)
+                again |= long
+                self._graph.add_edge(edge, robust=long)
+        return again
 
     def _retrieve(self, event: KeyframeEvent) -> list[int]:
         """Keyframes that look similar but are not already linked."""
@@ -142,4 +147,5 @@ class LoopClosurePipeline:
     def _optimise(self) -> CorrectedKeyframes:
         self._graph.optimise()
         self._version += 1
-        return CorrectedKeyframes(self._version, self.poses)
+        pieces = {k: self._events[root].piece_id for k, root in self._graph.components.items()}
+        return CorrectedKeyframes(self._version, self.poses, pieces)

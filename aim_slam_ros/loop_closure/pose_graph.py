@@ -125,6 +125,11 @@ class PoseGraph:
         guesses = torch.stack([self.pose(e.a) @ e.T_a_b for e in known])
         return sim3.mean(guesses, torch.stack([1.0 / (e.sigma ** 2).sum() for e in known]))
 
+    @property
+    def components(self) -> dict[int, int]:
+        """The oldest keyframe that each keyframe is connected with."""
+        return dict(self._component)
+
     def neighbours(self, keyframe_id: int) -> tuple[int, ...]:
         """Keyframes that share an edge with this one, the first linked first."""
         return tuple(dict.fromkeys(self._neighbours[keyframe_id]))
