@@ -37,7 +37,9 @@ class Admission:
         resized = cv2.resize(image, (model_width, model_height),
                              interpolation=cv2.INTER_AREA if shrink else cv2.INTER_CUBIC)
         scale_x, scale_y = model_width / width, model_height / height
-        calibrated = self._config.use_calibration and K is not None
+        # A camera_info of zeros says that nobody has calibrated the camera.
+        calibrated = self._config.use_calibration and K is not None \
+            and bool(np.isfinite(K).all()) and K[0, 0] > 0 and K[1, 1] > 0
         K_model = camera.scaled(torch.as_tensor(K, dtype=torch.float64), scale_x, scale_y) \
             if calibrated else None
         return Frame(stamp_ns, resized, K_model, scale_y / scale_x)

@@ -59,7 +59,7 @@ class FrontendPipeline:
                 K: np.ndarray | None = None) -> FrameResult:
         """One image [H,W,3] uint8 RGB, with its intrinsics [3,3] in pixels where known."""
         clock = Stopwatch()
-        inferences = self._window.inferences
+        inferences, piece_id = self._window.inferences, self._map.piece_id
         with clock.stage('admit'):
             frame = self._admission.admit(stamp_ns, image, K)
         if isinstance(frame, str):
@@ -68,7 +68,7 @@ class FrontendPipeline:
             result = self._initialise(frame, clock)
         else:
             result = self._track(frame, clock)
-        return replace(result, piece_id=self._map.piece_id, stage_s=clock.seconds,
+        return replace(result, piece_id=piece_id, stage_s=clock.seconds,
                        inferences=self._window.inferences - inferences)
 
     def apply_correction(self, corrected: CorrectedKeyframes) -> None:
