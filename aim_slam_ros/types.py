@@ -105,6 +105,11 @@ class Keyframe:
     def frame(self) -> Frame:
         return self.encoding.frame
 
+    @cached_property
+    def median_depth(self) -> float:
+        """In its own unit."""
+        return float(self.points_cam[::8, ::8, 2].median())
+
     @property
     def stamp_ns(self) -> int:
         return self.encoding.frame.stamp_ns

@@ -17,8 +17,8 @@ from ..types import Keyframe
 from .landmarks import LandmarkCache
 
 _SEARCH_PX = 90.0      # how far a point may be from a prediction by motion alone
-_SEARCH_POINTS = 60    # strongest corners per reference that are searched that far
-_SEARCH_MIN = 12       # found points below which the search says nothing
+_SEARCH_POINTS = 80    # strongest corners of a reference that are searched that far
+_SEARCH_MIN = 20       # found points below which the search says nothing
 _TIGHT_PX = 12.0       # and from the prediction by the pose that they gave
 
 
@@ -59,7 +59,9 @@ class Follower:
     def follow(self, grey: np.ndarray, K: Tensor, T_world_cam_guess: Tensor,
                references: Sequence[Keyframe]) -> Followed:
         """references: the one that counts for matched_fraction first. K: [3,3] of the image."""
-        first = self._find(grey, K, T_world_cam_guess, references, wide=True)
+        first = self._find(grey, K, T_world_cam_guess, references[:1], wide=True)
+        if len(first.uv) < _SEARCH_MIN:
+            first = self._find(grey, K, T_world_cam_guess, references, wide=True)
         solution = self._solve(first, K, T_world_cam_guess, _SEARCH_MIN)
         T_world_cam = T_world_cam_guess if solution is None else \
             sim3.inverse(solution.T_cam_ref)

@@ -89,7 +89,7 @@ class ImageTracker:
                 continue
             alone = solve_rigid(matches.points_world[rows], matches.uv[rows],
                                 window.prediction.K[0], joint.T_cam_ref,
-                                matches.spread_world[rows], self._config.sigma_px, iterations=5)
+                                matches.spread_world[rows], self._config.sigma_px, iterations=3)
             scale = self._scale(window, matches, alone.T_cam_ref, rows)
             if scale:
                 measured[keyframe.keyframe_id] = sim3.inverse(keyframe.T_world_kf) \

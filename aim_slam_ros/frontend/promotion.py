@@ -86,9 +86,8 @@ class Promotion:
 
 
 def _edge(older: Keyframe, newer_id: int, T_older_newer: Tensor) -> PoseEdge:
-    depth = float(older.points_cam[::8, ::8, 2].median())
     sigma = torch.tensor(_EDGE_SIGMA, dtype=torch.float64)
-    sigma[:3] *= depth
+    sigma[:3] *= older.median_depth
     return PoseEdge(older.keyframe_id, newer_id, T_older_newer, sigma)
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from torch import Tensor
 
 from ..config import Config
-from ..geometry import sim3
 from ..types import Keyframe
 from .following import Followed, Follower
 from .keyframe_map import KeyframeMap
@@ -62,7 +63,9 @@ class References:
 
 def _distance(keyframe: Keyframe, T_world_cam: Tensor) -> float:
     """How far two viewpoints are apart: baseline by depth, plus angle in radians."""
-    T = keyframe.T_world_kf
-    depth = float(keyframe.points_cam[::16, ::16, 2].median() * sim3.scale_of(T))
-    baseline = float((T[:3, 3] - T_world_cam[:3, 3]).norm())
-    return baseline / max(depth, 1e-9) + sim3.angle_rad(T, T_world_cam)
+    a, b = keyframe.T_world_kf.numpy(), T_world_cam.numpy()
+    scale = float(np.linalg.norm(a[0, :3]))
+    baseline = float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
+    cosine = (float((a[:3, :3] * b[:3, :3]).sum()) / scale - 1.0) / 2.0
+    return baseline / max(keyframe.median_depth * scale, 1e-9) \
+        + math.acos(max(-1.0, min(1.0, cosine)))
