@@ -59,7 +59,7 @@ class Follower:
     def follow(self, grey: np.ndarray, K: Tensor, T_world_cam_guess: Tensor,
                references: Sequence[Keyframe]) -> Followed:
         """references: the one that counts for matched_fraction first. K: [3,3] of the image."""
-        first = self._find(grey, K, T_world_cam_guess, references[:1], wide=True)
+        first = self._find(grey, K, T_world_cam_guess, references, wide=True)
         if len(first.uv) < _SEARCH_MIN:
             first = self._find(grey, K, T_world_cam_guess, references, wide=True)
         solution = self._solve(first, K, T_world_cam_guess, _SEARCH_MIN)

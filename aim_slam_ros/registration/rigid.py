@@ -66,7 +66,7 @@ def solve_rigid(points_ref: np.ndarray, uv: np.ndarray, K: Tensor, T_cam_ref_gue
             continue
         gain = now.cost - new.cost
         T, now, damping = T_new, new, max(damping * 0.3, 1e-9)
-        if gain < 1e-4 * now.cost:
+        if gain < 1e-5 * now.cost:
             break
     return _solution(T, now)
 
