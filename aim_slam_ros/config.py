@@ -246,6 +246,9 @@ class KeyframesConfig(_Section):
         'instead of making a new one; 1 never reuses', 0.1, 1)
     min_confident: float = _setting(
         0.15, 'smallest share of pixels with a measured depth for a prediction to be used', 0, 1)
+    long_edge: int = _setting(
+        8, 'a pose-graph edge over more keyframes than this is measured between its two ends '
+        "alone: the map's poses would repeat the drift between them", 1, 100000)
     max_fuse_spread: float = _setting(
         0.15, 'a prediction whose log depth ratios to the keyframe scatter more is not fused',
         0.01, 2)

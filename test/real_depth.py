@@ -12,7 +12,7 @@ from torch import Tensor
 
 from aim_slam_ros.geometry import camera, sim3
 
-SEQUENCE = Path('/work/shared/data/tum_fr1_xyz')
+SEQUENCE = Path(__file__).resolve().parents[2] / 'shared/data/tum_fr1_xyz'
 HEIGHT, WIDTH = 196, 259
 
 

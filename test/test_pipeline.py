@@ -21,7 +21,7 @@ from aim_slam_ros.geometry import sim3
 from aim_slam_ros.models import make_model
 from aim_slam_ros.types import CorrectedKeyframes, FrameResult, KeyframePose, TrackingStatus
 
-DATA = Path('/work/shared/data')
+DATA = Path(__file__).resolve().parents[2] / 'shared/data'
 TRACKED, LOST = TrackingStatus.TRACKED, TrackingStatus.LOST
 SKIPPED, INITIALISING = TrackingStatus.SKIPPED, TrackingStatus.INITIALISING
 BEGUN = 16      # of the clip's images: by then the map has begun

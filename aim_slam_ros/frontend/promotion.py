@@ -71,18 +71,22 @@ class Promotion:
 
     def event(self, keyframe: Keyframe, measured: Mapping[int, Tensor],
               reference_id: int) -> KeyframeEvent:
-        """What loop closure is told, with an edge for each measured T_older_keyframe.
+        """What loop closure is told, with an edge to the reference and to all that measured it.
 
-        Where nothing was measured, the edge to the reference is what the map has.
+        measured: T_older_keyframe as each older keyframe alone sees it. A short edge is what the
+        map has, the joint solution; over a long one that would repeat the drift between its ends.
         """
-        relative = dict(measured) or {
-            reference_id: sim3.inverse(self._map[reference_id].T_world_kf) @ keyframe.T_world_kf}
-        edges = tuple(_edge(self._map[i], keyframe.keyframe_id, T)
-                      for i, T in sorted(relative.items()) if i != keyframe.keyframe_id)
+        T_kf_world = sim3.inverse(keyframe.T_world_kf)
+        edges = []
+        for i in sorted({reference_id, *measured} - {keyframe.keyframe_id}):
+            T = sim3.inverse(T_kf_world @ self._map[i].T_world_kf)
+            if i in measured and keyframe.keyframe_id - i > self._config.long_edge:
+                T = measured[i]
+            edges.append(_edge(self._map[i], keyframe.keyframe_id, T))
         return KeyframeEvent(
             keyframe.keyframe_id, keyframe.piece_id, keyframe.stamp_ns, keyframe.frame.image,
             keyframe.K, keyframe.points_cam, keyframe.confidence, keyframe.T_world_kf,
-            keyframe.encoding.descriptor, edges, self._map.take_moved(keyframe.keyframe_id))
+            keyframe.encoding.descriptor, tuple(edges), self._map.take_moved(keyframe.keyframe_id))
 
 
 def _edge(older: Keyframe, newer_id: int, T_older_newer: Tensor) -> PoseEdge:

@@ -18,7 +18,7 @@ from ..types import Frame, FrameEncoding, KeyframeEvent, WindowPrediction
 from .one_way import OneWay, View, register
 
 _ENCODINGS = 32             # kept; a candidate is often looked at again by the next keyframe
-_FLOOR = (0.01, 0.005, 0.01)    # least sigma: translation / median depth, rotation, log-scale
+_FLOOR = (0.02, 0.01, 0.02)    # least sigma: translation / median depth, rotation, log-scale
 
 
 @dataclass(frozen=True)
