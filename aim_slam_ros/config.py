@@ -8,266 +8,193 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import re
-from dataclasses import dataclass, field
-from typing import Any, Mapping, TypeVar
+from dataclasses import dataclass
+from typing import Any, Mapping
 
 import yaml
 
-T = TypeVar('T')
-
-
-class ConfigError(ValueError):
-    """A setting that does not exist or a value outside its range."""
-
-
-def _setting(default: T, doc: str, low: float | None = None, high: float | None = None,
-             choices: tuple[str, ...] | None = None, multiple_of: int = 1) -> T:
-    """A dataclass field with its documentation and its allowed values."""
-    return field(default=default,
-                 metadata={'doc': doc, 'low': low, 'high': high, 'choices': choices,
-                           'multiple_of': multiple_of})
-
-
-def allowed(spec: dataclasses.Field[Any]) -> str:
-    """The allowed values of a field, for a person."""
-    low, high = spec.metadata['low'], spec.metadata['high']
-    if spec.metadata['choices']:
-        return 'one of ' + ', '.join(spec.metadata['choices'])
-    if isinstance(spec.default, bool):
-        return 'true or false'
-    kind = {int: 'a whole number', float: 'a number'}.get(type(spec.default), 'text')
-    if spec.metadata['multiple_of'] > 1:
-        kind = f'a multiple of {spec.metadata["multiple_of"]}'
-    if low is not None and high is not None:
-        return f'{kind} from {low} to {high}'
-    if low is not None:
-        return f'{kind} of at least {low}'
-    return kind
-
-
-def _checked(name: str, spec: dataclasses.Field[Any], value: Any) -> Any:
-    """The value in the field's own type, or ConfigError."""
-    refusal = ConfigError(f'{name}: {value!r} is not allowed; expected {allowed(spec)}')
-    kind = type(spec.default)
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if type(value) is not kind:
-        raise refusal
-    low, high = spec.metadata['low'], spec.metadata['high']
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        # written so that nan, which compares false with everything, is refused too
-        if not ((low is None or value >= low) and (high is None or value <= high)
-                and abs(value) < float('inf')):
-            raise refusal
-    if spec.metadata['choices'] and value not in spec.metadata['choices']:
-        raise refusal
-    if kind is int and value % spec.metadata['multiple_of']:
-        raise refusal
-    return value
-
-
-def _parsed(name: str, text: str) -> Any:
-    """The value that a person typed, or ConfigError."""
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f'{name}: {text!r} cannot be read as a value') from error
-    try:    # YAML takes 1e-3 for text: it wants 1.0e-3
-        return float(value) if isinstance(value, str) else value
-    except ValueError:
-        return value
-
-
-class _Section:
-    """Validates every field when it is made."""
-
-    def __post_init__(self) -> None:
-        for spec in dataclasses.fields(self):  # type: ignore[arg-type]
-            words = re.findall('[A-Z][a-z]*', type(self).__name__.removesuffix('Config'))
-            name = f'{"_".join(words).lower()}.{spec.name}'
-            object.__setattr__(self, spec.name, _checked(name, spec, getattr(self, spec.name)))
+from .settings import ConfigError, Section, checked, parsed, setting
 
 
 @dataclass(frozen=True)
-class CameraConfig(_Section):
-    width: int = _setting(
+class CameraConfig(Section):
+    width: int = setting(
         518, 'width of the image the model sees [px]', 84, 1036, multiple_of=14)
-    use_calibration: bool = _setting(
+    use_calibration: bool = setting(
         False, "take the dataset's or camera_info's intrinsics instead of estimating them")
-    fov_deg: float = _setting(
+    fov_deg: float = setting(
         60.0, 'horizontal field of view assumed where nothing better is known [deg]', 20, 140)
-    min_side: int = _setting(
+    min_side: int = setting(
         32, 'a smaller image than this is skipped [px]', 8, 1000)
-    min_contrast: float = _setting(
+    min_contrast: float = setting(
         2.0, 'an image whose grey values have a smaller standard deviation is skipped', 0, 100)
 
 
 @dataclass(frozen=True)
-class ModelConfig(_Section):
-    name: str = _setting('classical', 'the geometry model', choices=('classical',))
-    infer: str = _setting(
+class ModelConfig(Section):
+    name: str = setting('classical', 'the geometry model', choices=('classical',))
+    infer: str = setting(
         'on_demand', 'when the model is asked: where it pays, or for every image as in the paper',
         choices=('on_demand', 'every_image'))
 
 
 @dataclass(frozen=True)
-class ClassicalConfig(_Section):
-    features: int = _setting(800, 'SIFT features per frame, at half resolution', 50, 10000)
-    ratio: float = _setting(0.9, 'ratio test between best and second-best match', 0.1, 1)
-    min_matches: int = _setting(24, 'fewer matches than this leave a view unconnected', 8, 1000)
-    rotation_gate_px: float = _setting(
+class ClassicalConfig(Section):
+    features: int = setting(800, 'SIFT features per frame, at half resolution', 50, 10000)
+    ratio: float = setting(0.9, 'ratio test between best and second-best match', 0.1, 1)
+    min_matches: int = setting(24, 'fewer matches than this leave a view unconnected', 8, 1000)
+    rotation_gate_px: float = setting(
         6.0, 'median residual of a pure rotation below which there is no parallax '
         '[px at a width of 518]', 0, 100)
-    planes: int = _setting(48, 'inverse-depth planes of the sweep', 8, 256)
+    planes: int = setting(48, 'inverse-depth planes of the sweep', 8, 256)
 
 
 @dataclass(frozen=True)
-class SigmaConfig(_Section):
+class SigmaConfig(Section):
     """Choice of the window's keyframes (SIGMA)."""
 
-    voxel_fraction: float = _setting(
+    voxel_fraction: float = setting(
         0.06, "voxel size as a fraction of the first keyframe's median depth", 0.005, 1)
-    voxel_quantile: float = _setting(
+    voxel_quantile: float = setting(
         0.1, 'this share of a keyframe, its least confident points, is not indexed', 0, 0.95)
-    stride: int = _setting(
+    stride: int = setting(
         4, 'every so many pixels of a keyframe are indexed and ranked', 1, 64)
-    candidates: int = _setting(10, 'keyframes kept by voxel overlap for the ranking', 1, 100)
-    points: int = _setting(
+    candidates: int = setting(10, 'keyframes kept by voxel overlap for the ranking', 1, 100)
+    points: int = setting(
         1000, 'least confident points of the last keyframe that the gain is computed on', 10,
         100000)
-    sigma_px: float = _setting(1.0, 'noise of a pixel [px]', 0.01, 100)
-    sigma_depth: float = _setting(
+    sigma_px: float = setting(1.0, 'noise of a pixel [px]', 0.01, 100)
+    sigma_depth: float = setting(
         0.05, 'relative noise of the depth at the median confidence', 1e-4, 1)
-    sigma_ray: float = _setting(
+    sigma_ray: float = setting(
         1e-3, 'isotropic noise added to a measured ray [rad]', 1e-6, 0.1)
-    depth_tolerance: float = _setting(
+    depth_tolerance: float = setting(
         0.15, 'relative depth difference above which a candidate does not see a point', 0.001, 1)
-    kappa: float = _setting(
+    kappa: float = setting(
         1.0, 'reduced chi-square above which another keyframe joins the window', 0)
-    max_window: int = _setting(5, 'views of a window, the current frame included', 2, 20)
+    max_window: int = setting(5, 'views of a window, the current frame included', 2, 20)
 
 
 @dataclass(frozen=True)
-class JointTrackingConfig(_Section):
+class JointTrackingConfig(Section):
     """The paper's joint solve (``tracker: paper``)."""
 
-    residual: str = _setting(
+    residual: str = setting(
         'hybrid', 'what is compared besides log-distances', choices=('ray', 'pixel', 'hybrid'))
-    pairs: str = _setting(
+    pairs: str = setting(
         'composed', 'neighbouring views only, or also those with one view between them',
         choices=('adjacent', 'composed'))
-    stride: int = _setting(4, 'every so many pixels of a view are matched', 1, 64)
-    sigma_ray: float = _setting(0.003, 'noise of a ray [rad]', 1e-6, 1)
-    sigma_pixel: float = _setting(1.0, 'noise of a projection [px]', 0.01, 100)
-    sigma_log_distance: float = _setting(0.05, 'noise of a log-distance', 1e-4, 10)
-    huber: float = _setting(1.345, 'whitened residual where Huber turns linear', 0.1, 100)
-    max_iterations: int = _setting(15, 'Levenberg-Marquardt steps per stage', 1, 200)
-    relative_decrease: float = _setting(
+    stride: int = setting(4, 'every so many pixels of a view are matched', 1, 64)
+    sigma_ray: float = setting(0.003, 'noise of a ray [rad]', 1e-6, 1)
+    sigma_pixel: float = setting(1.0, 'noise of a projection [px]', 0.01, 100)
+    sigma_log_distance: float = setting(0.05, 'noise of a log-distance', 1e-4, 10)
+    huber: float = setting(1.345, 'whitened residual where Huber turns linear', 0.1, 100)
+    max_iterations: int = setting(15, 'Levenberg-Marquardt steps per stage', 1, 200)
+    relative_decrease: float = setting(
         1e-3, 'a step that lowers the cost by a smaller share ends a stage', 1e-12, 0.1)
-    depth_tolerance: float = _setting(
+    depth_tolerance: float = setting(
         0.15, 'relative distance difference above which a match is an occlusion', 0.001, 1)
-    confidence_quantile: float = _setting(
+    confidence_quantile: float = setting(
         0.1, 'this share of a view, its least confident points, is not matched', 0, 0.95)
-    min_match_fraction: float = _setting(
+    min_match_fraction: float = setting(
         0.05, 'a pair of views that shares less is not used', 0, 1)
-    memory: float = _setting(
+    memory: float = setting(
         1.0, 'weight of the earlier observations of a keyframe pair: 0 overwrites its relative '
         'pose, 1 moves it by 1/(n+1) after n of them', 0, 100)
 
 
 @dataclass(frozen=True)
-class LoopClosureConfig(_Section):
+class LoopClosureConfig(Section):
     """Retrieval, verification, pose graph and the fused map."""
 
-    enabled: bool = _setting(True, 'look for loops; otherwise only collect and fuse keyframes')
-    candidates: int = _setting(2, 'most similar keyframes that are verified', 1, 10)
-    min_gap: int = _setting(
+    enabled: bool = setting(True, 'look for loops; otherwise only collect and fuse keyframes')
+    candidates: int = setting(2, 'most similar keyframes that are verified', 1, 10)
+    min_gap: int = setting(
         8, 'keyframes nearer in time than this many are no candidates; a longer edge of the '
         'frontend is verified as a loop', 1, 1000)
-    covisible_hops: int = _setting(
+    covisible_hops: int = setting(
         2, 'keyframes within this many edges are no candidates', 0, 10)
-    similarity: float = _setting(
+    similarity: float = setting(
         0.5, 'least similarity of a candidate: 0 is the median over all keyframes, 1 the best of '
         "the keyframe's neighbours", 0, 1)
-    min_matched: float = _setting(
+    min_matched: float = setting(
         0.15, "fraction of a keyframe's textured points around which the other must look the "
         'same, in both directions', 0, 1)
-    max_kappa: float = _setting(2.0, 'largest reduced chi-square of a verified loop', 0.1, 1000)
-    max_disagreement: float = _setting(
+    max_kappa: float = setting(2.0, 'largest reduced chi-square of a verified loop', 0.1, 1000)
+    max_disagreement: float = setting(
         0.08, 'largest difference between the two directions of a loop, relative to the median '
         'depth for translations and natural (rad, log-scale) for the rest', 0.001, 1)
-    max_depth_spread: float = _setting(
+    max_depth_spread: float = setting(
         0.25, 'largest robust deviation of the log depth ratios between matched points', 0.01, 2)
-    cauchy_width: float = _setting(
+    cauchy_width: float = setting(
         3.0, 'whitened residual at which a loop edge has lost half its weight', 0.1, 100)
-    map_voxel: float = _setting(
+    map_voxel: float = setting(
         0.01, "voxel of the fused map, as a fraction of the keyframes' median depth", 0.001, 0.2)
-    map_percentile: float = _setting(
+    map_percentile: float = setting(
         40.0, 'the least confident part of each keyframe that the map leaves out [%]', 0, 99)
 
 
 @dataclass(frozen=True)
-class FollowingConfig(_Section):
-    points: int = _setting(250, 'corners of a keyframe that are followed', 50, 5000)
-    spacing_px: int = _setting(9, 'smallest distance between two of them [px]', 2, 50)
-    references: int = _setting(3, 'keyframes an image is followed against', 1, 10)
-    sigma_px: float = _setting(0.6, 'standard deviation of a followed point [px]', 0.05, 10)
-    sigma_depth: float = _setting(
+class FollowingConfig(Section):
+    points: int = setting(250, 'corners of a keyframe that are followed', 50, 5000)
+    spacing_px: int = setting(9, 'smallest distance between two of them [px]', 2, 50)
+    references: int = setting(3, 'keyframes an image is followed against', 1, 10)
+    sigma_px: float = setting(0.6, 'standard deviation of a followed point [px]', 0.05, 10)
+    sigma_depth: float = setting(
         0.03, "relative standard deviation of a keyframe's depth at its mean confidence",
         0.001, 0.5)
-    min_inliers: int = _setting(30, 'fewer explained points than this are no pose', 6, 1000)
-    min_inlier_ratio: float = _setting(
+    min_inliers: int = setting(30, 'fewer explained points than this are no pose', 6, 1000)
+    min_inlier_ratio: float = setting(
         0.4, 'smallest share of the found points that the pose must explain', 0.05, 1)
 
 
 @dataclass(frozen=True)
-class TrackingConfig(_Section):
-    tracker: str = _setting(
+class TrackingConfig(Section):
+    tracker: str = setting(
         'image', "refine matches in the images, or the paper's joint Sim(3) solve",
         choices=('image', 'paper'))
-    stride: int = _setting(12, 'every so many pixels of a keyframe are matched [px]', 1, 64)
-    sigma_px: float = _setting(
+    stride: int = setting(12, 'every so many pixels of a keyframe are matched [px]', 1, 64)
+    sigma_px: float = setting(
         1.0, 'standard deviation of a refined match [px]; calibrates kappa', 0.05, 10)
-    min_matches: int = _setting(60, 'fewer refined matches than this: keep the pose mean',
-                                10, 100000)
-    max_stray: float = _setting(
+    min_matches: int = setting(60, 'fewer refined matches than this: keep the pose mean',
+                               10, 100000)
+    max_stray: float = setting(
         0.15, 'how far the solve may move the camera from its start, relative to the median '
         'depth, before the start is kept instead', 0.01, 10)
 
 
 @dataclass(frozen=True)
-class KeyframesConfig(_Section):
-    promote_below: float = _setting(
+class KeyframesConfig(Section):
+    promote_below: float = setting(
         0.5, 'an image that still sees a smaller share of its reference keyframe is promoted',
         0.05, 0.95)
-    reuse_above: float = _setting(
+    reuse_above: float = setting(
         0.6, 'an older keyframe of which the image sees at least this share is taken as reference '
         'instead of making a new one; 1 never reuses', 0.1, 1)
-    min_confident: float = _setting(
+    min_confident: float = setting(
         0.15, 'smallest share of pixels with a measured depth for a prediction to be used', 0, 1)
-    long_edge: int = _setting(
+    long_edge: int = setting(
         8, 'a pose-graph edge over more keyframes than this is measured between its two ends '
         "alone: the map's poses would repeat the drift between them", 1, 100000)
-    max_fuse_spread: float = _setting(
+    max_fuse_spread: float = setting(
         0.15, 'a prediction whose log depth ratios to the keyframe scatter more is not fused',
         0.01, 2)
 
 
 @dataclass(frozen=True)
-class InitialisationConfig(_Section):
-    min_parallax_px: float = _setting(
+class InitialisationConfig(Section):
+    min_parallax_px: float = setting(
         6.0, 'parallax awaited by a model that needs two views [px at a width of 518]', 0.5, 200)
-    max_frames: int = _setting(
+    max_frames: int = setting(
         60, 'after so many images the map is begun without parallax', 2, 10000)
 
 
 @dataclass(frozen=True)
-class RelocalisationConfig(_Section):
-    candidates: int = _setting(3, 'keyframes retrieved for a lost image', 1, 20)
-    min_matched_fraction: float = _setting(
+class RelocalisationConfig(Section):
+    candidates: int = setting(3, 'keyframes retrieved for a lost image', 1, 20)
+    min_matched_fraction: float = setting(
         0.3, 'smallest matched fraction that ends a loss', 0.05, 1)
-    give_up_after: int = _setting(
+    give_up_after: int = setting(
         45, 'after so many lost images a new map piece is begun', 1, 100000)
 
 
@@ -275,7 +202,7 @@ class RelocalisationConfig(_Section):
 class Config:
     """All sections. ``seed`` fixes every random choice."""
 
-    seed: int = _setting(0, 'seed of every random choice', 0, 2**31 - 1)
+    seed: int = setting(0, 'seed of every random choice', 0, 2**31 - 1)
     camera: CameraConfig = CameraConfig()
     model: ModelConfig = ModelConfig()
     classical: ClassicalConfig = ClassicalConfig()
@@ -292,7 +219,7 @@ class Config:
         """A copy with settings replaced, ``{'section.name': 'text'}``; raises ConfigError."""
         config = self
         for name, text in values.items():
-            config = config._with(name, _parsed(name, text))
+            config = config._with(name, parsed(name, text))
         return config
 
     def _with(self, name: str, value: Any) -> Config:
@@ -303,7 +230,7 @@ class Config:
         spec = specs.get(field_name)
         if spec is None or not spec.metadata:
             raise ConfigError(f'{name}: there is no such setting{self._nearest(name)}')
-        new = dataclasses.replace(section, **{field_name: _checked(name, spec, value)})
+        new = dataclasses.replace(section, **{field_name: checked(name, spec, value)})
         changed: dict[str, Any] = {section_name: new}
         return dataclasses.replace(self, **changed) if section_name else new
 

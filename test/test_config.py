@@ -7,7 +7,8 @@ import dataclasses
 import pytest
 import yaml
 
-from aim_slam_ros.config import CameraConfig, Config, ConfigError, allowed
+from aim_slam_ros.config import CameraConfig, Config
+from aim_slam_ros.settings import ConfigError, allowed
 
 
 def test_values_are_set_by_name_and_others_stay() -> None:

@@ -18,7 +18,8 @@ _BASE = ('types', 'config', 'geometry')
 _ROOMS = {
     '__init__': (),
     'types': (),
-    'config': (),
+    'settings': (),
+    'config': ('settings',),
     'geometry': ('types',),
     'registration': _BASE,
     'models': _BASE,

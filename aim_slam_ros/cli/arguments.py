@@ -7,7 +7,8 @@ import tempfile
 from pathlib import Path
 from typing import Callable, Iterable
 
-from aim_slam_ros.config import Config, ConfigError, allowed
+from aim_slam_ros.config import Config
+from aim_slam_ros.settings import ConfigError, allowed
 
 
 class Refusal(Exception):
