@@ -3,17 +3,21 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+DATA ?= data
+OUT ?= out/benchmark
 
 # Idle OpenMP threads that spin cost other processes several times their own work.
 export OMP_WAIT_POLICY := PASSIVE
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help venv test lint clean
+.PHONY: help venv test lint benchmark clean
 
 help:
 	@echo 'make test    run the tests'
 	@echo 'make lint    flake8 and mypy'
+	@echo 'make benchmark DATA=folder OUT=folder'
+	@echo '             measure both pipelines on the recordings in DATA; takes some minutes'
 	@echo 'make venv    make $(VENV) from the pinned requirements (test and lint do so themselves)'
 	@echo 'make clean   remove $(VENV) and caches'
 
@@ -24,6 +28,9 @@ test: $(READY)
 
 lint: $(READY)
 	@status=0; $(BIN)/python -m flake8 || status=1; $(BIN)/python -m mypy || status=1; exit $$status
+
+benchmark: $(READY)
+	@$(BIN)/python benchmark/offline.py --data $(DATA) --out $(OUT)
 
 clean:
 	@rm -rf $(VENV) .pytest_cache .mypy_cache

@@ -47,13 +47,20 @@ class FusedMap:
 
     def __init__(self, config: LoopClosureConfig) -> None:
         self._config = config
+        self._pending: list[KeyframeEvent] = []
         self._thinned: dict[int, _Thinned] = {}
 
     def add(self, event: KeyframeEvent) -> None:
-        """Take a keyframe in; one without a usable point contributes nothing."""
-        usable = _usable(event, self._config.map_percentile)
-        if bool(usable.any()):
-            self._thinned[event.keyframe_id] = _thin(event, usable, self._config.map_voxel)
+        """Take a keyframe in; the work on it waits until a map is asked for."""
+        self._pending.append(event)
+
+    def _thin_pending(self) -> None:
+        """A keyframe without a usable point contributes nothing."""
+        for event in self._pending:
+            usable = _usable(event, self._config.map_percentile)
+            if bool(usable.any()):
+                self._thinned[event.keyframe_id] = _thin(event, usable, self._config.map_voxel)
+        self._pending.clear()
 
     def fuse(self, poses: Mapping[int, Tensor]) -> Cloud:
         """All keyframes in the world, one point per voxel: its confidence-weighted mean.
@@ -61,6 +68,7 @@ class FusedMap:
         poses: T_world_kf [4,4] by keyframe id. The voxel is ``map_voxel`` of the median depth, in
         world units.
         """
+        self._thin_pending()
         placed = [(self._thinned[k], T) for k, T in poses.items() if k in self._thinned]
         if not placed:
             return Cloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))

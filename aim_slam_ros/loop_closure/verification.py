@@ -76,6 +76,8 @@ class LoopVerifier:
             return _refused('image sizes differ')
         usable = [c for c in companions if c.image.shape == newer.image.shape]
         prediction = self._model.infer([self._encode(e) for e in (newer, older, *usable)])
+        if not prediction.rotation_only and min(map(prediction.seen_share, (0, 1))) == 0.0:
+            return _refused('not connected by the model')
         view_newer, view_older = View.of(newer), View.of(older)
         T_older_newer = sim3.inverse(prediction.T_first_cam[1])
         forward = register(view_older, view_newer, _in_unit_of(
