@@ -32,7 +32,7 @@ def _admitted(image: np.ndarray, K: np.ndarray | None = None,
                                             ((900, 300), (1554, 518)), ((32, 5000), (14, 518))])
 def test_sides_become_multiples_of_a_patch(size: tuple[int, int],
                                            expected: tuple[int, int]) -> None:
-    """FACTS 3: width 518, height round(h 518/w/14) 14, at least one patch."""
+    """As VGGT's preprocessing: width 518, height round(h 518/w/14) 14, at least one patch."""
     frame = _admitted(_image(*size))
     assert (frame.height, frame.width) == expected
     assert frame.image.dtype == np.uint8 and frame.image.shape == (*expected, 3)

@@ -300,7 +300,7 @@ class TestModel:
             truth = clip.T_a_b(WINDOW[0], WINDOW[view])
             got = sim3.rigid_part(window.T_first_cam[view])
             assert math.degrees(sim3.angle_rad(got, truth)) < 1.5
-            # two per cent of a median depth of 2 to 3 m (FACTS 9: half of a good window's error)
+            # two per cent of a median depth of 2 to 3 m (half of a good window's error)
             assert float((unit * got[:3, 3] - truth[:3, 3]).norm()) < 0.06
 
     def test_depth_is_right_where_it_is_sure(self, clip: Clip, window: WindowPrediction) -> None:
@@ -309,7 +309,7 @@ class TestModel:
             error = (window.depth[view] * _unit(window, clip, view) / true).log().abs()
             confidence = window.confidence[view]
             sure = confidence > confidence.median()
-            # FACTS 9: 2.5 to 4 per cent over the confident half, 5 to 6 over all
+            # On real images: 2.5 to 4 per cent over the confident half, 5 to 6 over all
             assert float(error[sure].median()) < 0.04
             assert float(error[sure].mean()) < 0.6 * float(error[~sure].mean())
 

@@ -1,7 +1,7 @@
 """The paper's solve on scenes of known geometry.
 
 Where the prediction's own poses are wrong, its matches are wrong in the same way and the solve
-follows them (FACTS 4.2): what it can repair, and what is tested here, is a wrong state, that is
+follows them: what it can repair, and what is tested here, is a wrong state, that is
 keyframe poses, scales and guesses that disagree with the prediction.
 """
 
@@ -186,7 +186,7 @@ def test_kappa_is_one_where_the_noise_is_what_the_sigmas_say() -> None:
 
 @pytest.mark.parametrize('residual', ['ray', 'pixel', 'hybrid'])
 def test_the_basin_is_wide(residual: str) -> None:
-    """From 30 degrees, half the depth and a factor of 2 away (FACTS 4.5)."""
+    """From 30 degrees, half the depth and a factor of 2 away."""
     pair, config = _noisy_pair(1e-3, 1e-2), replace(CONFIG, residual=residual)
     for seed in range(6):
         xi = torch.randn(7, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)

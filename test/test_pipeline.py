@@ -149,7 +149,7 @@ class TestTracking:
         assert len(tracked) > 5
         assert all(r.inferences >= 1 and r.window for r in tracked[1:])
         assert any(r.kappa is not None for r in tracked)
-        assert _ate(_poses(results), clip) < 0.12   # the paper's solve drifts more (FACTS 10)
+        assert _ate(_poses(results), clip) < 0.12   # the paper's solve drifts more
 
     def test_the_papers_tracker_on_demand(self, clip: Clip) -> None:
         results = _feed(_pipeline(clips.config(tracking__tracker='paper')), clip, range(34))

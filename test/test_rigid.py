@@ -87,7 +87,7 @@ def test_wrong_depths_are_forgiven_where_they_are_told() -> None:
 
 
 def test_turning_away_is_no_solution() -> None:
-    """Points behind the camera cost a constant (FACTS 4.5)."""
+    """Points behind the camera cost a constant."""
     points, uv = _scene()
     X = points.numpy().copy()
     X[:40] -= 20.0 * TRUTH[2, :3].numpy()     # behind the true camera: they can never be seen

@@ -1,7 +1,7 @@
 """The default tracker: the inference predicts dense matches, the images refine them.
 
 Matches that come from the inference whose poses are then optimised carry no new information
-(FACTS 10), so the prediction is only where the search in the images starts.
+(measured), so the prediction is only where the search in the images starts.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .tracking import TrackingResult, TrackingWindow
 
 
 class ImageTracker:
-    """Rigid part from refined matches of stored points, scale from depth ratios (DESIGN 7)."""
+    """Rigid part from refined matches of stored points, scale from depth ratios."""
 
     def __init__(self, config: TrackingConfig, following: FollowingConfig,
                  min_seen: float) -> None:

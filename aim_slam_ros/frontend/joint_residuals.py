@@ -88,7 +88,7 @@ class PairResiduals:
         config, T = self._config, T_i_j.to(self._points_j)
         X = T[:, :3, :3] @ self._points_j + T[:, :3, 3:]
         d2 = X.square().sum(1)
-        # Behind the camera a point costs a constant: it must not pay to go there (FACTS 4.5).
+        # Behind the camera a point costs a constant: it must not pay to go there.
         front = X[:, 2] > 0.01 * d2.sqrt()
         X = torch.where(front[:, None], X, torch.ones_like(X))
         q = torch.where(front, self._q, torch.zeros_like(self._q))
@@ -108,7 +108,7 @@ class PairResiduals:
             equations = equations + rays.pixel_normal_equations(
                 X, e_px, by_px.weight, self._focal)
             cost = cost + by_px.cost
-        # Rays and pixels are the same data twice: only one of them counts (FACTS 4.7).
+        # Rays and pixels are the same data twice: only one of them counts.
         chi2 = chi2 + (by_px.chi2 if kind == 'pixel' else by_ray.chi2)
         used = self._q > 0
         behind = (used & ~front).sum(-1)

@@ -1,7 +1,7 @@
 """Levenberg-Marquardt over the adjacent relative Sim(3) of a window (paper, joint optimisation).
 
 The state is one link T^k_{k+1} per two neighbouring views; a pair (i, j) further apart sees the
-product of its links, and its equations are carried to each of them by the adjoint (FACTS 4.6).
+product of its links, and its equations are carried to each of them by the adjoint.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from ..geometry import sim3
 from ..geometry.rays import NormalEquations
 from .joint_residuals import PairMatches, PairResiduals
 
-# Every eighth match is enough while rays alone bring the state near: they have the widest basin
-# (FACTS 4.5).
+# Every eighth match is enough while rays alone bring the state near: they have the widest basin.
 COARSE_STEP = 8
 
 

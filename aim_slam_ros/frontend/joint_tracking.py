@@ -1,7 +1,7 @@
 """The paper's tracker: one Sim(3) solve over the whole window (paper, joint optimisation).
 
 Matches come from the current inference, points from the stored keyframes, so that the two carry
-different information (FACTS 4.2). Measured, the image tracker does better (FACTS 10); this one
+different information. Measured, the image tracker does better; this one
 is kept to be compared, and because another model may shift the balance.
 """
 

@@ -1,4 +1,4 @@
-"""The frontend: an image in, a pose out, keyframe events beside it (paper, Fig. 2; DESIGN 2)."""
+"""The frontend: an image in, a pose out, keyframe events beside it (paper, Fig. 2)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Rays: matching by them, and the residuals of the joint optimisation with their Jacobians.
 
 With X' = T X, d = |X'| and r = X'/d, all Jacobians are with respect to a left perturbation of T in
-the order (translation, rotation, log-scale), so dX' = [I, -[X']x, X'] (FACTS 4.4). Residuals are
+the order (translation, rotation, log-scale), so dX' = [I, -[X']x, X']. Residuals are
 measured minus predicted.
 """
 
@@ -55,7 +55,7 @@ def sample(image: Tensor, uv: Tensor) -> Tensor:
 
 def match_rays(points_i: Tensor, points_j_in_i: Tensor, K: Tensor, iterations: int = 4,
                tolerance_px: float = 0.5) -> RayMatches:
-    """Where in view i the ray of each point lies, by a fixed point (FACTS 4.3).
+    """Where in view i the ray of each point lies, by a fixed point.
 
     points_i: [H,W,3] pointmap of view i, in its camera frame. points_j_in_i: [N,3]. K: [3,3].
     With U(p) the projection of the pointmap at p and u* that of the point, p <- p + (u* - U(p)):
@@ -114,7 +114,7 @@ def pixel_jacobian(points: Tensor, K: Tensor) -> Tensor:
 
 def ray_normal_equations(points: Tensor, e_ray: Tensor, e_log: Tensor, ray_weight: Tensor,
                          distance_weight: Tensor) -> NormalEquations:
-    """Ray and log-distance rows in closed form, without [N,4,7] Jacobians (FACTS 4.4).
+    """Ray and log-distance rows in closed form, without [N,4,7] Jacobians.
 
     points: [P,3,N], already transformed. e_ray: [P,3,N], difference of unit rays. e_log: [P,N].
     Weights: [P,N], inverse variances. All sums are moments of weights times monomials of the ray:

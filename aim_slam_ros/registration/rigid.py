@@ -48,7 +48,7 @@ def solve_rigid(points_ref: np.ndarray, uv: np.ndarray, K: Tensor, T_cam_ref_gue
     spread_ref: [N,3], one standard deviation of each point as a vector (its depth error along the
     ray it was seen on); a point is then trusted across that direction but not along it.
     Levenberg-Marquardt with Cauchy weights. Points behind the camera cost a constant, so that the
-    solver cannot win by turning away from them (FACTS 4.5).
+    solver cannot win by turning away from them.
     """
     X = np.asarray(points_ref, np.float64)
     uv = np.asarray(uv, np.float64)
@@ -91,7 +91,7 @@ def solve_rigid_from_scratch(points_ref: np.ndarray, uv: np.ndarray, K: Tensor,
 
 def _linearise(T: np.ndarray, X: np.ndarray, uv: np.ndarray, K: np.ndarray,
                spread: np.ndarray | None, sigma_px: float) -> _Linearised:
-    """Residuals, weights and normal equations at T; the Jacobians are FACTS 4.4's pixel rows."""
+    """Residuals, weights and normal equations at T; Jacobians as in geometry/rays.py."""
     P = X @ T[:3, :3].T + T[:3, 3]
     front = P[:, 2] > 1e-6
     z = np.where(front, P[:, 2], 1.0)

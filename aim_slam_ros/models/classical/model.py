@@ -26,7 +26,7 @@ _KNOWS_NOTHING = 1.001  # confidence of a depth that is only a prior
 
 
 class ClassicalModel:
-    """SIFT, essential matrix, a small bundle adjustment, plane sweep (FACTS 9).
+    """SIFT, essential matrix, a small bundle adjustment, plane sweep.
 
     Its confidence is near 1 wherever the depth is filled in rather than seen, and everywhere when
     the views differ by a rotation alone.
