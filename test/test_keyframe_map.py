@@ -49,7 +49,7 @@ def test_ids_count_up_and_are_never_used_again() -> None:
     fourth = _add(keyframes, box_room.trajectory(1)[0])
     assert [k.keyframe_id for k in keyframes.all] == [0, 1, 2, 3]
     assert (fourth.piece_id, keyframes.piece_id, keyframes[1].piece_id) == (1, 1, 0)
-    assert keyframes.piece == (fourth,) and keyframes.last is fourth
+    assert keyframes.piece == (fourth,) and keyframes.piece[-1] is fourth
 
 
 def test_covisible_are_those_that_share_space() -> None:

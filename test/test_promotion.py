@@ -87,7 +87,7 @@ def test_a_keyframe_keeps_its_unit_in_its_pose(clip: Clip) -> None:
     new = clips.promotion(keyframes).promote(
         clips.encoding(clip, 14), _followed(clip, keyframes, 14),
         _estimate(clip, keyframes, 14, _prediction(clip, [14, 10])), _K(clip))
-    assert new is not None and new is keyframes.last
+    assert new is not None and new is keyframes.piece[-1]
     assert float(sim3.scale_of(new.T_world_kf)) == pytest.approx(UNIT)
     K = _K(clip)
     truth = sim3.transform(clip.T_world_cam[14], camera.unproject(clip.depth_of(14), K))

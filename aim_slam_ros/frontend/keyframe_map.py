@@ -42,11 +42,6 @@ class KeyframeMap:
         """The keyframes of the current piece, oldest first."""
         return tuple(self._keyframes[i] for i in self._piece_ids)
 
-    @property
-    def last(self) -> Keyframe:
-        """The newest keyframe of the current piece."""
-        return self._keyframes[self._piece_ids[-1]]
-
     def begin_piece(self) -> None:
         """Start a new, unconnected map; the first piece needs no call."""
         self.piece_id = self._pieces_begun = self._pieces_begun + 1

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any, Sequence
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from ..config import Config
@@ -187,8 +186,7 @@ class FrontendPipeline:
             return []
         before, self._references.main_id = self._references.main_id, keyframe.keyframe_id
         # What was measured is in the inference's unit; a carried pointmap is in the world's.
-        own = torch.equal(keyframe.T_world_kf, estimate.result.T_world_frame)
-        measured = estimate.result.measured if own else {}
+        measured = estimate.result.measured if self._promotion.has_depth(estimate) else {}
         return [self._promotion.event(keyframe, measured, before)]
 
     def _tracked(self, frame: Frame, T_world_cam: Tensor,

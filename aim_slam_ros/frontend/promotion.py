@@ -47,14 +47,18 @@ class Promotion:
         Where the inference did not measure any (motion without parallax, for a model that needs
         it), with the depth of the followed points; None where there are none either.
         """
-        prediction = estimate.prediction
-        if (estimate.ok and not prediction.rotation_only
-                and prediction.seen_share(0) >= self._config.min_confident):
-            return self._add(encoding, prediction, 0, estimate.result.T_world_frame)
+        if self.has_depth(estimate):
+            return self._add(encoding, estimate.prediction, 0, estimate.result.T_world_frame)
         if not followed.ok:
             return None
         points, confidence = _carried(encoding.frame, followed, K)
         return self._map.add(encoding, K, points, confidence, followed.T_world_cam)
+
+    def has_depth(self, estimate: WindowEstimate) -> bool:
+        """Whether the inference measured the image's depth, so that a keyframe takes it over."""
+        prediction = estimate.prediction
+        return (estimate.ok and not prediction.rotation_only
+                and prediction.seen_share(0) >= self._config.min_confident)
 
     def _add(self, encoding: FrameEncoding, prediction: WindowPrediction, view: int,
              T_world_kf: Tensor) -> Keyframe:

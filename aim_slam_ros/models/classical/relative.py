@@ -58,8 +58,11 @@ class _Pair:
 
 @dataclass(frozen=True)
 class _Hypothesis:
+    """uv: [O,2] pixels of the observations; hub_rows: [M] hub feature of each point."""
+
     adjusted: Adjusted
     seen: Observations
+    uv: np.ndarray
     views: list[int]
     hub_rows: np.ndarray
     cost: float
@@ -80,7 +83,7 @@ def window_poses(features: Sequence[ClassicalFeatures], K: Sequence[Tensor],
              if (h := _hypothesis(pair, pairs, K, hub, seed)) is not None]
     if not found:
         return _rotations(hub, pairs, len(features))
-    return _result(min(found, key=lambda h: h.cost), hub, pairs, features)
+    return _result(min(found, key=lambda h: h.cost), hub, features)
 
 
 def _choose_hub(features: Sequence[ClassicalFeatures], matcher: Matcher,
@@ -150,12 +153,13 @@ def _hypothesis(first: _Pair, pairs: list[_Pair], K: Sequence[Tensor], hub: int,
         return None
     T_first[:3, 3] *= np.median(rho[usable])
     rho = np.clip(rho / np.median(rho[usable]), 0.05, 20.0)
-    start = dict(zip(first.hub_rows[usable], np.flatnonzero(usable)))
+    placed = np.full(max(int(pair.hub_rows.max()) for pair in pairs) + 1, -1)
+    placed[first.hub_rows[usable]] = np.flatnonzero(usable)
     poses, views = [T_first], [first.view]
     for pair in pairs:
         if pair.view == first.view:
             continue
-        T = _resect(pair, start, rays, rho)
+        T = _resect(pair, placed, rays, rho)
         if T is not None:
             poses.append(T)
             views.append(pair.view)
@@ -170,13 +174,16 @@ def _triangulate(T: np.ndarray, rays: np.ndarray, xy: np.ndarray) -> np.ndarray:
     return -(turned * moved).sum(1) / np.maximum((moved * moved).sum(1), 1e-12)
 
 
-def _resect(pair: _Pair, start: dict[int, int], rays: np.ndarray,
+def _resect(pair: _Pair, placed: np.ndarray, rays: np.ndarray,
             rho: np.ndarray) -> np.ndarray | None:
-    """T_view_hub [4,4] of a further view from the points already placed, or None."""
-    both = [(row, start[hub_row]) for row, hub_row in enumerate(pair.hub_rows) if hub_row in start]
-    if len(both) < 10:
+    """T_view_hub [4,4] of a further view from the points already placed, or None.
+
+    placed: by hub feature, the row of its ray and rho, or -1.
+    """
+    rows = np.flatnonzero(placed[pair.hub_rows] >= 0)
+    points = placed[pair.hub_rows[rows]]
+    if len(rows) < 10:
         return None
-    rows, points = (np.array(x) for x in zip(*both))
     found, rotation, translation, inliers = cv2.solvePnPRansac(
         rays[points] / rho[points, None], pair.xy[rows], np.eye(3), None, iterationsCount=100,
         reprojectionError=0.01, flags=cv2.SOLVEPNP_SQPNP)
@@ -206,10 +213,11 @@ def _adjusted(poses: np.ndarray, views: list[int], pairs: list[_Pair], first: _P
     adjusted = adjust(Bundle(poses, rays, start), seen, iterations=15)
     lost = sum(len(pair.uv) for pair in pairs if pair.view not in placed)
     cost = adjusted.cost + lost * float(np.log1p((_LOST_VIEW_PX / 1.5) ** 2))
-    return _Hypothesis(adjusted, seen, views, hub_rows, cost)
+    uv = np.concatenate([pair.uv for pair in used])
+    return _Hypothesis(adjusted, seen, uv, views, hub_rows, cost)
 
 
-def _result(best: _Hypothesis, hub: int, pairs: list[_Pair],
+def _result(best: _Hypothesis, hub: int,
             features: Sequence[ClassicalFeatures]) -> WindowPoses:
     bundle, n = best.adjusted.bundle, len(features)
     good = _well_placed(best)
@@ -227,20 +235,12 @@ def _result(best: _Hypothesis, hub: int, pairs: list[_Pair],
         T = bundle.T_view_hub[slot].copy()
         m = best.seen.point[rows]
         depth = ((bundle.rays[m] @ T[:3, :3].T)[:, 2] / bundle.rho[m] + T[2, 3]) * unit
-        xy = best.seen.xy[rows]
-        pair = next(p for p in pairs if p.view == view)
-        uv = _pixels(pair, xy)
+        uv = best.uv[rows]
         points[view] = SparsePoints(uv[depth > 0], depth[depth > 0])
         T[:3, 3] *= unit
         T_view_hub[view] = torch.from_numpy(T)
         connected[view] = True
     return WindowPoses(T_view_hub[0] @ sim3.inverse(T_view_hub), connected, False, tuple(points))
-
-
-def _pixels(pair: _Pair, xy: np.ndarray) -> np.ndarray:
-    """Back from normalised coordinates to the pixels of the pair's view."""
-    order = {tuple(x): row for row, x in enumerate(pair.xy)}
-    return pair.uv[[order[tuple(x)] for x in xy]]
 
 
 def _well_placed(best: _Hypothesis) -> np.ndarray:
