@@ -212,6 +212,22 @@ class FrameResult:
 
 
 @dataclass(frozen=True)
+class FrameReport:
+    """What other processes are told about one image.
+
+    session_id: of the run of the frontend; keyframe ids are unique within one. T_odom_cam: [4,4]
+    float64, rigid, in the odom frame with its axes as the first camera has them (OpenCV); None
+    unless TRACKED. result: its T_world_cam, events, late and reason do not travel. dropped:
+    images that found the frontend busy, so far.
+    """
+
+    session_id: int
+    result: FrameResult
+    T_odom_cam: Tensor | None = None
+    dropped: int = 0
+
+
+@dataclass(frozen=True)
 class StampedPoses:
     """A trajectory. stamps_ns: [N] int64, increasing. T_world_cam: [N,4,4] float64, rigid."""
 

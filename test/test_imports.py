@@ -30,6 +30,8 @@ _ROOMS = {
 }
 ALLOWED = {f'aim_slam_ros.{room}': tuple(f'aim_slam_ros.{name}' for name in names)
            for room, names in _ROOMS.items()}
+# What a message's pixels mean does not depend on ROS: bags are read without it.
+ALLOWED['aim_slam_ros.datasets'] += ('msg_adapters.encodings', 'msg_adapters.errors')
 ALLOWED |= {'msg_adapters': ('aim_slam_ros.types',)}
 ALLOWED |= {f'aim_slam_ros.{room}': EVERYTHING for room in ('nodes', 'cli', 'offline')}
 
