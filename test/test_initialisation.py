@@ -54,7 +54,8 @@ def _beginner(model: GeometryModel | None = None,
 def _offer(beginner: Initialisation, frames: Sequence[Frame]) -> tuple[int, Beginning | None]:
     """How many frames it took, and the beginning."""
     for count, frame in enumerate(frames, 1):
-        beginning = beginner.offer(frame, Stopwatch())
+        window = beginner.offer(frame, Stopwatch())
+        beginning = beginner.begin(beginner.infer(window, Stopwatch())) if window else None
         if beginning is not None:
             return count, beginning
     return len(frames), None

@@ -38,6 +38,11 @@ class Followed:
     uv: np.ndarray
     reason: str = ''
 
+    @property
+    def reference_id(self) -> int:
+        """The keyframe that it was followed against first."""
+        return next(iter(self.fractions))
+
 
 @dataclass(frozen=True)
 class _Found:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Sequence
 
 import cv2
 import numpy as np
@@ -20,11 +21,19 @@ _PATIENCE = 1.3         # a window that showed no depth is tried again with this
 
 
 @dataclass(frozen=True)
+class Inferred:
+    """An inference over a first window: the current frame first, the oldest second."""
+
+    encodings: tuple[FrameEncoding, ...]
+    prediction: WindowPrediction
+
+
+@dataclass(frozen=True)
 class Beginning:
     """The first window: encodings and prediction, the current frame first, the oldest second.
 
-    waiting: the frames between these two, oldest first. measured: false where the model never saw
-    depth and the map begins on its prior alone.
+    waiting: the other frames since the oldest, oldest first; some may be newer than the current
+    one. measured: false where the model never saw depth and the map begins on its prior alone.
     """
 
     encodings: tuple[FrameEncoding, ...]
@@ -43,26 +52,47 @@ class Initialisation:
         self._window_tracker = window
         self._min_seen = min_seen
         self._offered = 0
-        self._wanted_px: float = config.min_parallax_px
         self._restart()
 
-    def offer(self, frame: Frame, clock: Stopwatch) -> Beginning | None:
-        """One more image; the beginning once there is one."""
+    def offer(self, frame: Frame, clock: Stopwatch) -> tuple[Frame, ...]:
+        """One more image; the window to ask the model about, empty while that is too early."""
         self._offered += 1
         if self._window_tracker.min_views == 1:
-            return self._infer([frame], clock)
+            return (frame,)
         with clock.stage('follow'):
             parallax = self._track(frame)
-        late = self._offered >= self._config.max_frames
-        if parallax < self._wanted_px * frame.width / 518.0 and not late:
-            return None
+        if parallax < self._wanted_px * frame.width / 518.0 and not self._late:
+            return ()
         if len(self._frames) < self._window_tracker.min_views:
-            return None
-        beginning = self._infer(self._window(), clock)
-        if beginning.measured or late:
-            return beginning
-        self._wanted_px = _PATIENCE * max(self._wanted_px, parallax * 518.0 / frame.width)
+            return ()
+        self._asked_px = parallax * 518.0 / frame.width
+        return self._window()
+
+    def infer(self, frames: Sequence[Frame], clock: Stopwatch) -> Inferred:
+        """The model's answer about a window; changes nothing here."""
+        encodings = tuple(self._window_tracker.encode(frame, clock) for frame in frames)
+        return Inferred(encodings, self._window_tracker.infer(encodings, clock))
+
+    def begin(self, inferred: Inferred) -> Beginning | None:
+        """The beginning, unless the answer shows that it is too early."""
+        prediction = inferred.prediction
+        views = range(min(2, len(inferred.encodings)))
+        seen = min(prediction.seen_share(view) for view in views)
+        measured = seen >= self._min_seen and not prediction.rotation_only
+        if self._window_tracker.min_views == 1 or measured or self._late:
+            return Beginning(inferred.encodings, prediction, self._waiting(inferred.encodings),
+                             measured)
+        self._wanted_px = _PATIENCE * max(self._wanted_px, self._asked_px)
         return None
+
+    @property
+    def _late(self) -> bool:
+        return self._offered >= self._config.max_frames
+
+    def _waiting(self, encodings: Sequence[FrameEncoding]) -> tuple[Frame, ...]:
+        ends = {encodings[0].frame.stamp_ns, encodings[min(1, len(encodings) - 1)].frame.stamp_ns}
+        return tuple(frame for frame in self._frames
+                     if frame.stamp_ns not in ends and frame.stamp_ns > min(ends))
 
     def _restart(self) -> None:
         self._frames: list[Frame] = []
@@ -70,7 +100,8 @@ class Initialisation:
         self._uv_first = np.zeros((0, 2), np.float32)
         self._uv = self._uv_first
         self._started_with = 0
-        self._wanted_px = self._config.min_parallax_px
+        self._wanted_px: float = self._config.min_parallax_px
+        self._asked_px = 0.0
 
     def _track(self, frame: Frame) -> float:
         """Follow the first image's corners one image further; their parallax in pixels."""
@@ -82,6 +113,8 @@ class Initialisation:
             self._begin_from(frame)
         self._grey = frame.grey
         self._frames.append(frame)
+        if len(self._frames) > self._config.max_frames:     # a slow model: none of them is needed
+            del self._frames[1]
         return self._parallax(frame)
 
     def _begin_from(self, frame: Frame) -> None:
@@ -99,15 +132,8 @@ class Initialisation:
         a, b = (rotation.unit_rays(torch.from_numpy(uv), K) for uv in (self._uv_first, self._uv))
         return rotation.parallax_px(a, b, rotation.fit_rotation(a, b), float(K[0, 0]))
 
-    def _window(self) -> list[Frame]:
+    def _window(self) -> tuple[Frame, ...]:
         """The newest frame, the oldest, and up to two spread between them."""
         between = self._frames[1:-1]
         middle = [between[len(between) * k // 3] for k in (1, 2)] if len(between) > 2 else between
-        return [self._frames[-1], self._frames[0], *middle]
-
-    def _infer(self, frames: list[Frame], clock: Stopwatch) -> Beginning:
-        encodings = tuple(self._window_tracker.encode(frame, clock) for frame in frames)
-        prediction = self._window_tracker.infer(encodings, clock)
-        seen = min(prediction.seen_share(view) for view in range(min(2, len(frames))))
-        return Beginning(encodings, prediction, tuple(self._frames[1:-1]),
-                         seen >= self._min_seen and not prediction.rotation_only)
+        return (self._frames[-1], self._frames[0], *middle)

@@ -26,7 +26,7 @@ class KeyframeMap:
         self._piece_ids: list[int] = []
         self._moved: set[int] = set()
         self._descriptors: list[Tensor] = []
-        self.piece_id = self._pieces_begun = 0
+        self.piece_id = self.pieces_begun = 0
         self._index: VoxelIndex | None = None
 
     def __getitem__(self, keyframe_id: int) -> Keyframe:
@@ -44,7 +44,7 @@ class KeyframeMap:
 
     def begin_piece(self) -> None:
         """Start a new, unconnected map; the first piece needs no call."""
-        self.piece_id = self._pieces_begun = self._pieces_begun + 1
+        self.piece_id = self.pieces_begun = self.pieces_begun + 1
         self._piece_ids = []
         self._index = None
 

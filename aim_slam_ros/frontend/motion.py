@@ -24,7 +24,12 @@ class ConstantVelocity:
         return self._last[1]
 
     def update(self, stamp_ns: int, T_world_cam: Tensor) -> None:
-        self._before, self._last = self._last, (stamp_ns, T_world_cam)
+        """A second pose of the same image replaces the first; of an older one it says nothing."""
+        if self._last is not None and stamp_ns < self._last[0]:
+            return
+        if self._last is None or stamp_ns > self._last[0]:
+            self._before = self._last
+        self._last = (stamp_ns, T_world_cam)
 
     def stop(self) -> None:
         """Forget the velocity, keep the pose."""

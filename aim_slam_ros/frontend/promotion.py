@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Mapping
 
 import numpy as np
@@ -30,6 +31,7 @@ class Promotion:
     def __init__(self, config: KeyframesConfig, keyframes: KeyframeMap) -> None:
         self._config = config
         self._map = keyframes
+        self._edges: dict[int, tuple[PoseEdge, ...]] = {}
 
     def begin(self, beginning: Beginning) -> list[Keyframe]:
         """The first keyframes of a piece: the oldest view is the world, then the current one."""
@@ -87,10 +89,16 @@ class Promotion:
             if i in measured and keyframe.keyframe_id - i > self._config.long_edge:
                 T = measured[i]
             edges.append(_edge(self._map[i], keyframe.keyframe_id, T))
+        self._edges[keyframe.keyframe_id] = tuple(edges)
+        return replace(self.repeated_event(keyframe),
+                       moved=self._map.take_moved(keyframe.keyframe_id))
+
+    def repeated_event(self, keyframe: Keyframe) -> KeyframeEvent:
+        """The event once more, as the keyframe is now, with the edges as they were measured."""
         return KeyframeEvent(
             keyframe.keyframe_id, keyframe.piece_id, keyframe.stamp_ns, keyframe.frame.image,
             keyframe.K, keyframe.points_cam, keyframe.confidence, keyframe.T_world_kf,
-            keyframe.encoding.descriptor, tuple(edges), self._map.take_moved(keyframe.keyframe_id))
+            keyframe.encoding.descriptor, self._edges[keyframe.keyframe_id])
 
 
 def _edge(older: Keyframe, newer_id: int, T_older_newer: Tensor) -> PoseEdge:
