@@ -54,8 +54,9 @@ def _beginner(model: GeometryModel | None = None,
 def _offer(beginner: Initialisation, frames: Sequence[Frame]) -> tuple[int, Beginning | None]:
     """How many frames it took, and the beginning."""
     for count, frame in enumerate(frames, 1):
-        window = beginner.offer(frame, Stopwatch())
-        beginning = beginner.begin(beginner.infer(window, Stopwatch())) if window else None
+        ready = beginner.offer(frame, Stopwatch())
+        beginning = beginner.begin(beginner.infer(beginner.window(), Stopwatch())) \
+            if ready else None
         if beginning is not None:
             return count, beginning
     return len(frames), None

@@ -95,12 +95,16 @@ class ConcurrentFrontend:
         return placed
 
     def correct(self, corrected: CorrectedKeyframes) -> None:
-        """Take corrected poses as soon as the model rests; a newer correction replaces an older."""
+        """Take corrected poses once the model rests; a newer correction replaces an older."""
         self._correction = corrected
 
     def event(self, keyframe_id: int) -> KeyframeEvent:
         """A keyframe's event once more."""
         return self._pipeline.event(keyframe_id)
+
+    def unplaced(self, result: FrameResult) -> PlacedResult:
+        """A result that came about elsewhere, of an image that was of no use."""
+        return self._placed(result)
 
     def close(self) -> None:
         """Let the model's thread end after what it is doing."""

@@ -52,21 +52,30 @@ class Initialisation:
         self._window_tracker = window
         self._min_seen = min_seen
         self._offered = 0
+        self._wanted_px: float = config.min_parallax_px
+        self._frames: list[Frame] = []
+        self._asked: tuple[Frame, ...] = ()
         self._restart()
 
-    def offer(self, frame: Frame, clock: Stopwatch) -> tuple[Frame, ...]:
-        """One more image; the window to ask the model about, empty while that is too early."""
+    def offer(self, frame: Frame, clock: Stopwatch) -> bool:
+        """One more image; whether it is time to ask the model about the window."""
         self._offered += 1
         if self._window_tracker.min_views == 1:
-            return (frame,)
+            self._frames = [frame]
+            return True
         with clock.stage('follow'):
-            parallax = self._track(frame)
-        if parallax < self._wanted_px * frame.width / 518.0 and not self._late:
-            return ()
-        if len(self._frames) < self._window_tracker.min_views:
-            return ()
-        self._asked_px = parallax * 518.0 / frame.width
-        return self._window()
+            self._parallax_px = self._track(frame) * 518.0 / frame.width
+        return len(self._frames) >= self._window_tracker.min_views \
+            and (self._parallax_px >= self._wanted_px or self._late)
+
+    def window(self) -> tuple[Frame, ...]:
+        """What to ask about: the newest frame, the oldest, and up to two spread between them."""
+        self._asked_px, self._asked = self._parallax_px, tuple(self._frames)
+        if len(self._frames) == 1:
+            return (self._frames[0],)
+        between = self._frames[1:-1]
+        middle = [between[len(between) * k // 3] for k in (1, 2)] if len(between) > 2 else between
+        return (self._frames[-1], self._frames[0], *middle)
 
     def infer(self, frames: Sequence[Frame], clock: Stopwatch) -> Inferred:
         """The model's answer about a window; changes nothing here."""
@@ -90,18 +99,19 @@ class Initialisation:
         return self._offered >= self._config.max_frames
 
     def _waiting(self, encodings: Sequence[FrameEncoding]) -> tuple[Frame, ...]:
-        ends = {encodings[0].frame.stamp_ns, encodings[min(1, len(encodings) - 1)].frame.stamp_ns}
-        return tuple(frame for frame in self._frames
-                     if frame.stamp_ns not in ends and frame.stamp_ns > min(ends))
+        """Of those there were when the model was asked, and of those that came since."""
+        newest_ns = encodings[0].frame.stamp_ns
+        since = (frame for frame in self._frames if frame.stamp_ns > newest_ns)
+        return (*self._asked[1:-1], *since)
 
     def _restart(self) -> None:
-        self._frames: list[Frame] = []
+        self._frames = []
         self._grey: np.ndarray | None = None
         self._uv_first = np.zeros((0, 2), np.float32)
         self._uv = self._uv_first
         self._started_with = 0
-        self._wanted_px: float = self._config.min_parallax_px
-        self._asked_px = 0.0
+        self._wanted_px = self._config.min_parallax_px
+        self._parallax_px = self._asked_px = 0.0
 
     def _track(self, frame: Frame) -> float:
         """Follow the first image's corners one image further; their parallax in pixels."""
@@ -131,9 +141,3 @@ class Initialisation:
             frame.width, frame.height, self._fov_deg, frame.aspect)
         a, b = (rotation.unit_rays(torch.from_numpy(uv), K) for uv in (self._uv_first, self._uv))
         return rotation.parallax_px(a, b, rotation.fit_rotation(a, b), float(K[0, 0]))
-
-    def _window(self) -> tuple[Frame, ...]:
-        """The newest frame, the oldest, and up to two spread between them."""
-        between = self._frames[1:-1]
-        middle = [between[len(between) * k // 3] for k in (1, 2)] if len(between) > 2 else between
-        return (self._frames[-1], self._frames[0], *middle)

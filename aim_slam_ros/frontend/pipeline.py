@@ -104,7 +104,7 @@ class FrontendPipeline:
         return self._inquirer.run(inquiry)
 
     def conclude(self, inquiry: Inquiry, findings: Findings) -> FrameResult:
-        """What the findings mean for the map and for their image, which may have a pose already."""
+        """What the findings mean for the map and their image, which may have a pose already."""
         piece_id = self._map.piece_id
         if isinstance(inquiry, BeginningInquiry):
             result = self._begin_map(inquiry, findings)
@@ -143,10 +143,11 @@ class FrontendPipeline:
         return replace(result, piece_id=self._map.piece_id, stage_s=dict(clock.seconds))
 
     def _initialise(self, frame: Frame, clock: Stopwatch, may_ask: bool) -> Step:
-        window = self._initialisation.offer(frame, clock)
-        if window and may_ask:
-            return Step(None, BeginningInquiry(window, self._initialisation, clock))
-        reason = 'the model is busy' if window else 'waiting for parallax'
+        ready = self._initialisation.offer(frame, clock)
+        if ready and may_ask:
+            return Step(None, BeginningInquiry(self._initialisation.window(),
+                                               self._initialisation, clock))
+        reason = 'the model is busy' if ready else 'waiting for parallax'
         return Step(self._result(FrameResult(frame.stamp_ns, TrackingStatus.INITIALISING,
                                              reason=reason), clock))
 
@@ -170,9 +171,11 @@ class FrontendPipeline:
         """The images that the map had to wait for, followed against it now."""
         if not beginning.measured or len(keyframes) < 2:
             return ()
-        first = keyframes[0].frame
+        first, T_world_current = keyframes[0].frame, sim3.rigid_part(keyframes[1].T_world_kf)
         late = [self._tracked(first, sim3.rigid_part(keyframes[0].T_world_kf), ())]
         for frame in beginning.waiting:
+            if frame.stamp_ns > keyframes[1].stamp_ns:
+                self._motion.update(keyframes[1].stamp_ns, T_world_current)
             with clock.stage('follow'):
                 followed = self._follow(frame)
             if followed.ok:
