@@ -18,6 +18,7 @@ from .window import WindowTracker
 
 _FEWEST_TRACKS = 0.35   # a smaller share of the first image's corners left: begin again from here
 _PATIENCE = 1.3         # a window that showed no depth is tried again with this much more parallax
+_MOST = 4.0             # and never with more than so many times what was awaited first
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,7 @@ class Initialisation:
         self._wanted_px: float = config.min_parallax_px
         self._frames: list[Frame] = []
         self._asked: tuple[Frame, ...] = ()
+        self._asked_px = 0.0
         self._restart()
 
     def offer(self, frame: Frame, clock: Stopwatch) -> bool:
@@ -91,7 +93,8 @@ class Initialisation:
         if self._window_tracker.min_views == 1 or measured or self._late:
             return Beginning(inferred.encodings, prediction, self._waiting(inferred.encodings),
                              measured)
-        self._wanted_px = _PATIENCE * max(self._wanted_px, self._asked_px)
+        self._wanted_px = min(_PATIENCE * max(self._wanted_px, self._asked_px),
+                              _MOST * self._config.min_parallax_px)
         return None
 
     @property
@@ -110,8 +113,7 @@ class Initialisation:
         self._uv_first = np.zeros((0, 2), np.float32)
         self._uv = self._uv_first
         self._started_with = 0
-        self._wanted_px = self._config.min_parallax_px
-        self._parallax_px = self._asked_px = 0.0
+        self._parallax_px = 0.0
 
     def _track(self, frame: Frame) -> float:
         """Follow the first image's corners one image further; their parallax in pixels."""

@@ -1,0 +1,109 @@
+"""The frontend node: images in; poses, odometry, points and keyframes out."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any, Callable
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import Trigger
+
+from msg_adapters import diagnostics, keyframes
+from msg_adapters.errors import MessageError
+
+from ..models import make_model
+from ..models.base import GeometryModel
+from ..types import TrackingStatus
+from .frontend_output import FrontendOutput
+from .frontend_parameters import FrontendParameters
+from .frontend_statistics import FrontendStatistics
+from .frontend_worker import FrontendWorker
+from .image_input import CameraInfoInput, ImageInput
+from .loop_closure_parameters import LoopClosureParameters
+from .parameters import declare_config, declare_section, warn_of_unknown
+from .running import run
+
+
+class FrontendNode(Node):
+    """Callbacks hand over to the worker thread; the worker publishes."""
+
+    def __init__(self, wrap: Callable[[GeometryModel], GeometryModel] = lambda m: m) -> None:
+        """wrap: what is put around the model that the parameters name."""
+        super().__init__('frontend')
+        parameters = declare_section(self, FrontendParameters)
+        config = declare_config(self)
+        warn_of_unknown(self, LoopClosureParameters)
+        self._statistics = FrontendStatistics()
+        output = FrontendOutput(self, parameters)
+        info = CameraInfoInput(self, config.camera.use_calibration)
+        self.model = wrap(make_model(config))
+        self._worker = FrontendWorker(config, parameters, self.model, output, self._statistics,
+                                      self.get_logger(), info.K)
+        self._images = ImageInput(self, parameters, self._worker.offer)
+        self._subscribe_corrections()
+        self.create_service(Trigger, '~/resend_keyframes', self._resend_keyframes)
+        self.create_service(Trigger, '~/reset', self._reset)
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self.create_timer(1.0, self._diagnose)
+        self.get_logger().info(f'model {config.model.name}; waiting for images on '
+                               f'{self.resolve_topic_name("image")}')
+
+    def close(self) -> None:
+        """End the worker; a model at work is left to end with the process."""
+        self._worker.close()
+
+    def _subscribe_corrections(self) -> None:
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.create_subscription(
+            PointCloud2, 'keyframe_poses', self._correct, latched,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+
+    def _correct(self, message: PointCloud2) -> None:
+        try:
+            self._worker.correct(keyframes.correction(message))
+        except MessageError as error:
+            self.get_logger().error(f'corrected keyframe poses are not used: {error}',
+                                    throttle_duration_sec=5.0)
+
+    def _resend_keyframes(self, request: Any, response: Trigger.Response) -> Trigger.Response:
+        count = self._worker.resend()
+        response.success, response.message = True, f'{count} keyframes follow'
+        return response
+
+    def _reset(self, request: Any, response: Trigger.Response) -> Trigger.Response:
+        self._worker.reset()
+        response.success, response.message = True, 'the next image begins a new map'
+        return response
+
+    def _diagnose(self) -> None:
+        pipeline = self._worker.frontend.pipeline
+        values = self._statistics.values() | {
+            'keyframes': len(pipeline.keyframes),
+            'map_pieces': len({k.piece_id for k in pipeline.keyframes}),
+            'model_busy': str(self._worker.frontend.busy).lower(),
+            'session': self._worker.session_id}
+        level, text = self._condition()
+        self._diagnostics.publish(diagnostics.diagnostics_msg(
+            f'{self.get_fully_qualified_name()}: tracking', level, text, values,
+            self.get_clock().now().nanoseconds))
+
+    def _condition(self) -> tuple[bytes, str]:
+        last = self._statistics.last
+        if self._images.silent or last is None:
+            return DiagnosticStatus.WARN, 'no images come'
+        if last.status is TrackingStatus.TRACKED:
+            return DiagnosticStatus.OK, 'tracked'
+        return DiagnosticStatus.WARN, f'{last.status.value}: {last.reason}'
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The executable ``frontend``."""
+    return run(FrontendNode, argv)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
