@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import subprocess
@@ -10,7 +11,7 @@ import threading
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Callable, Sequence
+from typing import Any, Callable
 
 import rclpy
 from rclpy.context import Context
@@ -20,6 +21,7 @@ from rclpy.qos import QoSProfile
 
 ROOT = Path(__file__).resolve().parents[1]
 PATIENCE_S = 30.0   # on a busy machine a process takes 10 s until it is up
+_numbers = itertools.count()
 
 
 def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S) -> None:
@@ -83,12 +85,10 @@ class Process:
 class Peer:
     """A node of the test's own process, spun in a thread, that remembers what it hears."""
 
-    def __init__(self, name: str = 'peer', namespace: str = '',
-                 parameters: Sequence[Any] = ()) -> None:
+    def __init__(self) -> None:
         self.context = Context()
         rclpy.init(context=self.context)
-        self.node = Node(name, context=self.context, namespace=namespace,
-                         parameter_overrides=list(parameters))
+        self.node = Node(f'peer_{next(_numbers)}', context=self.context)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
         self._thread = threading.Thread(target=self._spin, daemon=True)

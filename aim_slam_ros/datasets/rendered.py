@@ -73,11 +73,14 @@ def load_rendered(source: str, cache_dir: Path | None) -> Sequence:
 
 
 def cache_folder(name: str, seed: int, cache_dir: Path | None = None) -> Path:
-    """Where a scene is kept; by default in the user's cache (XDG_CACHE_HOME or ~/.cache)."""
-    if cache_dir is None:
-        user = os.environ.get('XDG_CACHE_HOME') or '~/.cache'
-        cache_dir = Path(user).expanduser() / 'aim_slam_ros'
-    return cache_dir / f'rendered-{_VERSION}-{name}-{seed}'
+    """Where a scene is kept; by default in the user's cache."""
+    return (cache_dir or user_cache()) / f'rendered-{_VERSION}-{name}-{seed}'
+
+
+def user_cache() -> Path:
+    """Where this package keeps what it can make again; not made here."""
+    user = os.environ.get('XDG_CACHE_HOME') or '~/.cache'
+    return Path(user).expanduser() / 'aim_slam_ros'
 
 
 def render(name: str, out: Path, *, seed: int = 0, frames: slice = slice(None),

@@ -56,6 +56,8 @@ class StopSignals:
         """
         if any(thread.is_alive() for thread in threads):
             _exit(status)
+        for number in _SIGNALS:     # the interpreter's end gives handlers back, this it leaves
+            signal.signal(number, signal.SIG_IGN)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if self.told:
