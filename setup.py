@@ -1,14 +1,25 @@
 """The ament_python package; pinned third-party versions stand in requirements.txt."""
 
 from glob import glob
+from typing import Any
 
 from setuptools import find_packages, setup
+from setuptools.command.develop import develop
 
 NAME = 'aim_slam_ros'
 
+
+class Develop(develop):
+    """What `colcon build --symlink-install` calls; it does not heed [build_scripts] executable."""
+
+    def write_script(self, name: str, contents: str, *mode: Any) -> None:
+        body = contents.partition('\n')[2]
+        super().write_script(name, f'#!/usr/bin/env python3\n{body}', *mode)
+
+
 setup(
     name=NAME,
-    version='0.1.0',
+    version='0.2.0',
     description='AIM-SLAM for ROS 2: dense monocular SLAM around a geometry foundation model',
     author='aim_slam_ros developers',
     maintainer='aim_slam_ros developers',
@@ -20,10 +31,19 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
         *[(f'share/{NAME}/{folder}', files) for folder, files in (
-            ('config', sorted(glob('config/*.yaml'))),
-            ('launch', sorted(glob('launch/*.launch.py')))) if files],
+            ('config', [file for kind in ('yaml', 'rviz', 'xml')
+                        for file in sorted(glob(f'config/*.{kind}'))]),
+            ('launch', sorted(glob('launch/*.launch.py'))))],
     ],
     install_requires=['setuptools'],
+    extras_require={'weights': ['huggingface_hub']},
     zip_safe=True,
-    entry_points={'console_scripts': [f'evaluate = {NAME}.cli.evaluate:main']},
+    cmdclass={'develop': Develop},
+    entry_points={'console_scripts': [
+        f'frontend = {NAME}.nodes.frontend_node:main',
+        f'loop_closure = {NAME}.nodes.loop_closure_node:main',
+        f'slam = {NAME}.nodes.slam:main',
+        *[f'{name} = {NAME}.cli.{name}:main'
+          for name in ('convert', 'demo', 'download_weights', 'evaluate', 'play')],
+    ]},
 )

@@ -32,10 +32,16 @@ class CameraConfig(Section):
 
 @dataclass(frozen=True)
 class ModelConfig(Section):
-    name: str = setting('classical', 'the geometry model', choices=('classical',))
+    name: str = setting('classical', 'the geometry model', choices=('classical', 'vggt'))
+    weights: str = setting('', 'the file with the weights of vggt, or its folder')
+    device: str = setting(
+        'auto', 'where vggt runs: auto (the GPU where there is one), cpu, cuda or cuda:N')
     infer: str = setting(
         'on_demand', 'when the model is asked: where it pays, or for every image as in the paper',
         choices=('on_demand', 'every_image'))
+    min_inference_s: float = setting(
+        0.0, 'an inference is made to last at least so long: to spare a shared GPU, or to try '
+        'what a slower model would do [s]', 0, 60)
 
 
 @dataclass(frozen=True)
@@ -47,6 +53,18 @@ class ClassicalConfig(Section):
         6.0, 'median residual of a pure rotation below which there is no parallax '
         '[px at a width of 518]', 0, 100)
     planes: int = setting(48, 'inverse-depth planes of the sweep', 8, 256)
+
+
+@dataclass(frozen=True)
+class VggtConfig(Section):
+    precision: str = setting(
+        'auto', 'what its transformer multiplies in; auto is bfloat16 on a GPU that has it and '
+        'float32 elsewhere. The heads are always float32',
+        choices=('auto', 'float32', 'bfloat16'))
+    compile: bool = setting(
+        False, 'torch.compile: the first inferences take minutes, later ones less time')
+    cached_frames: int = setting(
+        64, 'images whose tokens are kept, 8.5 to 12.8 MB each at a width of 518', 1, 100000)
 
 
 @dataclass(frozen=True)
@@ -206,6 +224,7 @@ class Config:
     camera: CameraConfig = CameraConfig()
     model: ModelConfig = ModelConfig()
     classical: ClassicalConfig = ClassicalConfig()
+    vggt: VggtConfig = VggtConfig()
     following: FollowingConfig = FollowingConfig()
     tracking: TrackingConfig = TrackingConfig()
     keyframes: KeyframesConfig = KeyframesConfig()

@@ -4,19 +4,18 @@
 
 Every 2nd image, default settings (focal length unknown). FOLDER holds tum_fr1_xyz, redkitchen_600,
 tum_fr1_rpy_300 and kitti00_120 in TUM RGB-D form; those that are missing are skipped and said.
-Writes benchmark.json: ``name: number``, the unit in the name.
+Adds to benchmark.json: ``name: number``, the unit in the name.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from figures import Figures, add, said
 from scipy.spatial import cKDTree
 
 from aim_slam_ros import offline
@@ -27,7 +26,6 @@ from aim_slam_ros.evaluation.trajectory import Incomparable, compare
 
 STRIDE = 2
 EVERY_IMAGE_FRAMES = 300   # inferring for every image is measured on this many images
-Figures = dict[str, float | None]
 
 
 @dataclass(frozen=True)
@@ -62,8 +60,7 @@ def main() -> int:
             print(f'# {case.name} skipped: {error}', file=sys.stderr)
             continue
         figures |= _measure(case, sequence, args.seeds if case.seeds else 1)
-    (args.out / 'benchmark.json').write_text(json.dumps(figures, indent=2) + '\n',
-                                             encoding='utf-8')
+    add(args.out, figures)
     return 0
 
 
@@ -84,13 +81,13 @@ def _measure(case: Case, sequence: Sequence, seeds: int) -> Figures:
         figures |= _seeds(name, sequence, {'loop_closure.enabled': 'false'}, seeds)
         with_loops, without = (figures[f'{n}_ate_rmse_m_mean'] for n in (case.name, name))
         if with_loops and without:
-            figures |= _said({f'{case.name}_ate_less_with_loops_percent':
-                              100.0 * (1.0 - with_loops / without)})
+            figures |= said({f'{case.name}_ate_less_with_loops_percent':
+                             100.0 * (1.0 - with_loops / without)})
     if case.every_image:
         run = _run(sequence, {'model.infer': 'every_image'},
                    range(0, min(EVERY_IMAGE_FRAMES, len(sequence)), STRIDE))
-        figures |= _said({f'{case.name}_every_image_rate_hz': run.offered / run.wall_s,
-                          f'{case.name}_every_image_ate_rmse_m': _ate(run, sequence)})
+        figures |= said({f'{case.name}_every_image_rate_hz': run.offered / run.wall_s,
+                         f'{case.name}_every_image_ate_rmse_m': _ate(run, sequence)})
     return figures
 
 
@@ -98,12 +95,12 @@ def _seeds(name: str, sequence: Sequence, settings: dict[str, str], seeds: int) 
     figures: Figures = {}
     for seed in range(seeds):
         run = _run(sequence, settings | {'seed': str(seed)}, range(0, len(sequence), STRIDE))
-        figures |= _said({f'{name}_{key}_seed{seed}': value
-                          for key, value in _figures(run, sequence).items()})
+        figures |= said({f'{name}_{key}_seed{seed}': value
+                         for key, value in _figures(run, sequence).items()})
     errors = [figures[f'{name}_ate_rmse_m_seed{seed}'] for seed in range(seeds)]
     known = [error for error in errors if error is not None]
-    return figures | _said({f'{name}_ate_rmse_m_mean':
-                            float(np.mean(known)) if known else None})
+    return figures | said({f'{name}_ate_rmse_m_mean':
+                           float(np.mean(known)) if known else None})
 
 
 def _run(sequence: Sequence, settings: dict[str, str], indices: range) -> RunResult:
@@ -159,13 +156,6 @@ def _true_points(sequence: Sequence, stamp_ns: int) -> np.ndarray | None:
     z = depth[::8, ::8]
     points = np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], -1)
     return points[z > 0] @ T[:3, :3].T + T[:3, 3]
-
-
-def _said(figures: Figures) -> Figures:
-    for name, value in figures.items():
-        shown = 'none' if value is None or not math.isfinite(value) else f'{value:.4g}'
-        print(f'{name}: {shown}', flush=True)
-    return figures
 
 
 if __name__ == '__main__':

@@ -4,9 +4,23 @@ from __future__ import annotations
 
 from ..config import Config
 from .base import GeometryModel
+from .paced import PacedModel
 
 
 def make_model(config: Config) -> GeometryModel:
-    """The model named by ``model.name``; its imports happen only when it is chosen."""
+    """The model named by ``model.name``, at most as fast as ``model.min_inference_s`` allows.
+
+    Its imports happen only when it is chosen. Raises ConfigError where the settings or the
+    weights cannot be used.
+    """
+    model = _named(config)
+    least_s = config.model.min_inference_s
+    return PacedModel(model, least_s) if least_s > 0.0 else model
+
+
+def _named(config: Config) -> GeometryModel:
+    if config.model.name == 'vggt':
+        from .vggt.making import make_vggt
+        return make_vggt(config)
     from .classical.model import ClassicalModel
     return ClassicalModel(config.classical, config.camera.fov_deg, config.seed)

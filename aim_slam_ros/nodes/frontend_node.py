@@ -50,7 +50,7 @@ class FrontendNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_timer(1.0, self._diagnose)
         self.get_logger().info(f'model {config.model.name}; waiting for images on '
-                               f'{self.resolve_topic_name("image")}')
+                               f'{self._images.topic}')
 
     def close(self) -> None:
         """End the worker; a model at work is left to end with the process."""

@@ -46,6 +46,11 @@ class ImageInput:
         node.create_timer(_LOOK_S, self._look)
 
     @property
+    def topic(self) -> str:
+        """Its full name."""
+        return str(self._subscription.topic_name)
+
+    @property
     def silent(self) -> bool:
         """Whether no image has come for longer than allowed."""
         return self._silent

@@ -17,8 +17,8 @@ class LoopClosureParameters(Section):
     path_period_s: float = setting(
         1.0, 'the path is published at most this often, after changes [s]', 0.1, 3600)
     gap_s: float = setting(
-        3.0, 'after so long without a keyframe that is known to exist, the frontend is asked for '
-        'all of them again [s]', 0.1, 3600)
+        5.0, 'after so long without a keyframe that is known to exist, the frontend is asked for '
+        'all of them again; reliable delivery may take 3 s to repair a loss [s]', 0.1, 3600)
     silence_s: float = setting(
         5.0, 'after so long without a message the frontend is reported as silent [s]', 0.1, 3600)
     save_directory: str = setting(

@@ -64,10 +64,19 @@ def _init(argv: list[str] | None) -> None:
         raise ConfigError(f'the ROS arguments cannot be used: {reason}') from error
 
 
+def _made(make_nodes: MakeNodes) -> ClosableNode | Sequence[ClosableNode]:
+    try:
+        return make_nodes()
+    except RuntimeError as error:
+        if 'QoS override' in str(error):    # rclpy has no name for it
+            raise ConfigError(f'qos_overrides: {error}') from error
+        raise
+
+
 def _live(make_nodes: MakeNodes, argv: list[str] | None, stop: StopSignals) -> None:
     with stop.interrupting():
         _init(argv)
-        made = make_nodes()
+        made = _made(make_nodes)
     nodes = list(made) if isinstance(made, Sequence) else [made]
     executor = SingleThreadedExecutor()
     try:

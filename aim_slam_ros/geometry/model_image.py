@@ -1,0 +1,54 @@
+"""An image as VGGT's own preprocessing gives it to the network, and K on both sides of that."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from . import camera
+
+_PATCH_PX = 14   # both sides of the network's image are multiples of it
+
+
+@dataclass(frozen=True)
+class ModelImage:
+    """image: [H,W,3] uint8 RGB, contiguous. scale_x, scale_y: of the resize, which is anisotropic
+    since each side is rounded to patches by itself. top_px: rows cut off above after the resize.
+    """
+
+    image: np.ndarray
+    scale_x: float
+    scale_y: float
+    top_px: int
+
+    def K_model(self, K_camera: Tensor) -> Tensor:
+        """K [3,3] in pixels of the camera's image to K in pixels of this one."""
+        K = camera.scaled(K_camera.double(), self.scale_x, self.scale_y)
+        K[1, 2] -= self.top_px
+        return K
+
+    def K_camera(self, K_model: Tensor) -> Tensor:
+        """The inverse of ``K_model``."""
+        K = K_model.double().clone()
+        K[1, 2] += self.top_px
+        return camera.scaled(K, 1.0 / self.scale_x, 1.0 / self.scale_y)
+
+
+def model_image(image: np.ndarray, width: int) -> ModelImage:
+    """image: [H,W,3] uint8 RGB; resized to this width and, where it is higher than wide, cut to
+    its middle.
+
+    Bicubic and antialiased, as PIL does it (a grey level or two apart in a few pixels).
+    """
+    height = max(1, round(image.shape[0] * width / image.shape[1] / _PATCH_PX)) * _PATCH_PX
+    # a copy: images of messages are read-only, which torch does not know
+    channels = torch.tensor(image).permute(2, 0, 1)[None]
+    resized = F.interpolate(channels, (height, width), mode='bicubic', antialias=True)
+    top = max(0, height - width) // 2
+    cut = resized[0, :, top:top + width].permute(1, 2, 0).numpy()
+    return ModelImage(np.ascontiguousarray(cut), width / image.shape[1],
+                      height / image.shape[0], top)
