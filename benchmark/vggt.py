@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import json
+
 import re
 import sys
 import time
@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Callable, Sequence
 
 import torch
+from figures import Figures, add
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -40,7 +41,6 @@ SAME = 1e-5             # of a fixture's arrays, and of our own two paths
 # The official code adds up in another order: through 72 blocks and an exponential float32 rounding
 # (6e-8) may grow some hundred times.
 SAME_AS_OFFICIAL = 1e-4
-Figures = dict[str, float | None]
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f'{name}: {shown}', flush=True)
     if args.out:
         args.out.mkdir(parents=True, exist_ok=True)
-        (args.out / 'vggt.json').write_text(json.dumps(figures, indent=2) + '\n', encoding='utf-8')
+        add(args.out, figures)
     return 0 if same(figures) else 1
 
 
@@ -86,7 +86,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--repeat', type=int, default=1, metavar='N',
                         help='take the least of so many runs of each path')
     parser.add_argument('--threads', type=int, default=1, metavar='N')
-    parser.add_argument('--out', type=Path, metavar='FOLDER', help='write vggt.json there as well')
+    parser.add_argument('--out', type=Path, metavar='FOLDER', help='add to benchmark.json there')
     return parser
 
 

@@ -13,7 +13,7 @@ from aim_slam_ros.config import Config, LoopClosureConfig
 from aim_slam_ros.geometry import sim3
 from aim_slam_ros.loop_closure.pipeline import LoopClosurePipeline
 from aim_slam_ros.loop_closure.verification import LoopVerifier, Verification
-from aim_slam_ros.types import CorrectedKeyframes, KeyframeEvent, KeyframePose
+from aim_slam_ros.types import CorrectedKeyframes, KeyframeEvent, KeyframePose, PoseEdge
 from room_walk import RoomModel, ate, drifting_events, event, places, true_poses
 
 LAST = 32       # sees what keyframe 0 saw
@@ -106,6 +106,9 @@ def test_the_walk_closes_and_the_drift_goes() -> None:
     after = ate(stacked(done.pipeline.poses), truth)
     assert done.pipeline.loops
     assert after < 0.4 * before
+    measured = {(e.a, e.b) for event in drifting_events(0.15) for e in event.edges}
+    assert set(done.pipeline.edges) == measured, 'loops stand apart'
+    assert done.pipeline.version == len(done.corrections)
 
 
 def test_an_edge_of_the_frontend_across_the_loop_corrects_the_drift() -> None:
@@ -178,6 +181,29 @@ def test_an_edge_to_a_lost_keyframe_waits_for_it() -> None:
     pipeline = walk([events[0], events[2], events[3]]).pipeline
     pipeline.add(events[1])
     assert [p.keyframe_id for p in pipeline.poses] == [0, 2, 3, 1]
+
+
+def test_keyframes_may_come_in_any_order() -> None:
+    """Resent ones do. What is near and what is a loop follows from when they were made."""
+    events = [dataclasses.replace(e, descriptor=torch.ones(4)) for e in drifting_events(0.0)]
+    late = [*events[1:12], *events[24:], *events[12:24], events[0]]
+    done = walk(late)
+    assert done.corrections == () and done.model.inferences == 0
+    assert set(done.pipeline.pieces.values()) == {0}
+    assert done.pipeline.edges == tuple((e.a, e.b) for e in _arrived(late))
+
+
+def _arrived(events: list[KeyframeEvent]) -> list[PoseEdge]:
+    """Edges in the order in which both of their ends are there."""
+    known: set[int] = set()
+    waiting: list[PoseEdge] = []
+    arrived = []
+    for event in events:
+        known.add(event.keyframe_id)
+        waiting += event.edges
+        arrived += [e for e in waiting if {e.a, e.b} <= known]
+        waiting = [e for e in waiting if not {e.a, e.b} <= known]
+    return arrived
 
 
 def test_new_keyframes_are_chained_on_in_the_corrected_world() -> None:

@@ -183,8 +183,9 @@ def test_neighbourhoods() -> None:
     graph.add_keyframe(20, sim3.identity())     # a piece of its own
     assert graph.within(10, 2) == {8, 9, 10, 11, 12}
     assert graph.neighbours(10) == (9, 11)
-    assert graph.neighbourhood(19, hops=1, gap=5) == {16, 17, 18, 19}
+    assert graph.neighbourhood(19, hops=1, gap=5) == {15, 16, 17, 18, 19}
     assert graph.neighbourhood(20, hops=1, gap=5) == {20}
+    assert graph.neighbourhood(10, hops=1, gap=3) == {8, 9, 10, 11, 12}, 'one that came late'
 
 
 def test_a_new_keyframe_is_chained_to_the_mean_of_its_edges() -> None:

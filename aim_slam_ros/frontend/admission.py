@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import torch
 
 from ..config import CameraConfig
-from ..geometry import camera
+from ..geometry.model_image import model_image
 from ..types import Frame
-
-_PATCH = 14   # the model's patch size: both sides of its image are multiples of it
 
 
 class Admission:
@@ -30,19 +27,12 @@ class Admission:
         if reason:
             return reason
         self._size, self._stamp_ns = image.shape[:2], stamp_ns
-        height, width = image.shape[:2]
-        model_width = self._config.width
-        model_height = max(1, round(height * model_width / width / _PATCH)) * _PATCH
-        shrink = model_width < width
-        resized = cv2.resize(image, (model_width, model_height),
-                             interpolation=cv2.INTER_AREA if shrink else cv2.INTER_CUBIC)
-        scale_x, scale_y = model_width / width, model_height / height
+        resized = model_image(image, self._config.width)
         # A camera_info of zeros says that nobody has calibrated the camera.
         calibrated = self._config.use_calibration and K is not None \
             and bool(np.isfinite(K).all()) and K[0, 0] > 0 and K[1, 1] > 0
-        K_model = camera.scaled(torch.as_tensor(K, dtype=torch.float64), scale_x, scale_y) \
-            if calibrated else None
-        return Frame(stamp_ns, resized, K_model, scale_y / scale_x)
+        K_model = resized.K_model(torch.as_tensor(K)) if calibrated else None
+        return Frame(stamp_ns, resized.image, K_model, resized.scale_y / resized.scale_x)
 
     def _refusal(self, stamp_ns: int, image: np.ndarray) -> str:
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:

@@ -45,8 +45,8 @@ def model_image(image: np.ndarray, width: int) -> ModelImage:
     Bicubic and antialiased, as PIL does it (a grey level or two apart in a few pixels).
     """
     height = max(1, round(image.shape[0] * width / image.shape[1] / _PATCH_PX)) * _PATCH_PX
-    # a copy: images of messages are read-only, which torch does not know
-    channels = torch.tensor(image).permute(2, 0, 1)[None]
+    # copied by torch: images of messages are read-only, which it does not know
+    channels = torch.tensor(np.ascontiguousarray(image)).permute(2, 0, 1)[None]
     resized = F.interpolate(channels, (height, width), mode='bicubic', antialias=True)
     top = max(0, height - width) // 2
     cut = resized[0, :, top:top + width].permute(1, 2, 0).numpy()

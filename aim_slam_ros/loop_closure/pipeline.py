@@ -44,6 +44,7 @@ class LoopClosurePipeline:
         self._graph = PoseGraph(self._config.cauchy_width)
         self._map = FusedMap(self._config)
         self._events: dict[int, KeyframeEvent] = {}
+        self._piece_ids: dict[int, int] = {}
         self._waiting: list[PoseEdge] = []
         self._loops: list[AcceptedLoop] = []
         self._rejected: Counter[str] = Counter()
@@ -58,6 +59,8 @@ class LoopClosurePipeline:
         if event.keyframe_id in self._graph:
             return None
         self._insert(event)
+        if self._config.enabled:
+            self._events[event.keyframe_id] = event
         again = self._add_edges(event)
         if not self._config.enabled:
             return None
@@ -81,6 +84,22 @@ class LoopClosurePipeline:
         """Every keyframe in the corrected world."""
         return tuple(KeyframePose(k, T) for k, T in self._graph.poses().items())
 
+    @property
+    def pieces(self) -> Mapping[int, int]:
+        """The map piece of every keyframe; joined ones carry the id of the oldest keyframe's."""
+        return {k: self._piece_ids[root] for k, root in self._graph.components.items()}
+
+    @property
+    def version(self) -> int:
+        """How many corrections there have been."""
+        return self._version
+
+    @property
+    def edges(self) -> tuple[tuple[int, int], ...]:
+        """The pairs of keyframes that the frontend measured, loops left out."""
+        loops = {(loop.older, loop.newer) for loop in self._loops}
+        return tuple(edge for edge in self._graph.edges if edge not in loops)
+
     def fused_map(self) -> Cloud:
         """The corrected world's cloud, in the world's unit."""
         return self._map.fuse(self._graph.poses())
@@ -91,6 +110,7 @@ class LoopClosurePipeline:
         chained = self._graph.chained(event.keyframe_id, event.edges) if self._version else None
         T_world_kf = event.T_world_kf if chained is None else chained
         self._graph.add_keyframe(event.keyframe_id, T_world_kf)
+        self._piece_ids[event.keyframe_id] = event.piece_id
         T_graph_frontend = T_world_kf @ sim3.inverse(event.T_world_kf)
         for moved in event.moved:
             if moved.keyframe_id in self._graph:
@@ -116,7 +136,6 @@ class LoopClosurePipeline:
 
     def _retrieve(self, event: KeyframeEvent) -> list[int]:
         """Keyframes that look similar but are not already linked."""
-        self._events[event.keyframe_id] = event
         self._retrieval.add(event.keyframe_id, event.descriptor)
         similar = self._retrieval.candidates(event.keyframe_id, self._graph.neighbourhood(
             event.keyframe_id, self._config.covisible_hops, self._config.min_gap))
@@ -147,5 +166,4 @@ class LoopClosurePipeline:
     def _optimise(self) -> CorrectedKeyframes:
         self._graph.optimise()
         self._version += 1
-        pieces = {k: self._events[root].piece_id for k, root in self._graph.components.items()}
-        return CorrectedKeyframes(self._version, self.poses, pieces)
+        return CorrectedKeyframes(self._version, self.poses, self.pieces)

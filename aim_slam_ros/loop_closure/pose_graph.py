@@ -73,6 +73,7 @@ class PoseGraph:
         self._robust: list[gtsam.BetweenFactorSimilarity3] = []
         self._neighbours: dict[int, list[int]] = {}
         self._component: dict[int, int] = {}
+        self._edges: list[tuple[int, int]] = []
 
     def __contains__(self, keyframe_id: int) -> bool:
         return keyframe_id in self._neighbours
@@ -101,6 +102,7 @@ class PoseGraph:
             self._robust.append(_between(edge))
         else:
             self._trusted.add(_between(edge))
+        self._edges.append((edge.a, edge.b))
         self._neighbours[edge.a].append(edge.b)
         self._neighbours[edge.b].append(edge.a)
         if self._component[edge.a] != self._component[edge.b]:
@@ -126,6 +128,11 @@ class PoseGraph:
         return sim3.mean(guesses, torch.stack([1.0 / (e.sigma ** 2).sum() for e in known]))
 
     @property
+    def edges(self) -> tuple[tuple[int, int], ...]:
+        """The two keyframes of every edge, in the order they were added."""
+        return tuple(self._edges)
+
+    @property
     def components(self) -> dict[int, int]:
         """The oldest keyframe that each keyframe is connected with."""
         return dict(self._component)
@@ -143,18 +150,20 @@ class PoseGraph:
         return reached
 
     def neighbourhood(self, keyframe_id: int, hops: int, gap: int) -> set[int]:
-        """Keyframes that may see the same without any loop: some edges away, or just before.
+        """Keyframes that may see the same without any loop: some edges away, or close in time.
 
-        gap: in keyframes; those of another component do not count as just before.
+        gap: in keyframes, by their ids, which count up in time whenever they arrive; those of
+        another component do not count as close in time.
         """
-        recent = list(self._neighbours)[-gap:]
         own = self._component[keyframe_id]
-        return self.within(keyframe_id, hops) | {k for k in recent if self._component[k] == own}
+        close = range(keyframe_id - gap + 1, keyframe_id + gap)
+        return self.within(keyframe_id, hops) | {
+            k for k in close if self._component.get(k) == own}
 
-    def is_long(self, edge: PoseEdge, gap: int) -> bool:
+    @staticmethod
+    def is_long(edge: PoseEdge, gap: int) -> bool:
         """Whether more keyframes than ``gap`` came between the ends: a loop in all but name."""
-        order = list(self._neighbours)
-        return abs(order.index(edge.a) - order.index(edge.b)) > gap
+        return abs(edge.a - edge.b) > gap
 
     def optimise(self) -> dict[int, Tensor]:
         """Batch Levenberg-Marquardt from the present poses; every T_world_kf [4,4] float64.
