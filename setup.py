@@ -40,10 +40,7 @@ setup(
     zip_safe=True,
     cmdclass={'develop': Develop},
     entry_points={'console_scripts': [
-        f'frontend = {NAME}.nodes.frontend_node:main',
-        f'loop_closure = {NAME}.nodes.loop_closure_node:main',
-        f'slam = {NAME}.nodes.slam:main',
-        *[f'{name} = {NAME}.cli.{name}:main'
-          for name in ('convert', 'demo', 'download_weights', 'evaluate', 'play')],
-    ]},
+        f'{name} = {NAME}.cli.{name}:main'
+        for name in ('frontend', 'loop_closure', 'slam', 'convert', 'demo', 'download_weights',
+                     'evaluate', 'play')]},
 )

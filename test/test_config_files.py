@@ -81,7 +81,7 @@ def test_rviz_shows_what_the_nodes_publish() -> None:
     """Display by display, against a real process with both nodes; RViz itself is not run."""
     displays = {display['Topic']['Value']: display for display in _displays()}
     with _node('onlooker', '') as onlooker:
-        process = subprocess.Popen([sys.executable, '-m', 'aim_slam_ros.nodes.slam',
+        process = subprocess.Popen([sys.executable, '-m', 'aim_slam_ros.cli.slam',
                                     '--ros-args', '-r', '__ns:=/shown'])
         try:
             _wait(lambda: {('frontend', '/shown'), ('loop_closure', '/shown')} <=

@@ -25,7 +25,7 @@ from msg_adapters import images
 from msg_adapters.frames import frame_report
 from msg_adapters.stamps import stamp_msg, stamp_ns
 
-MODULE = 'aim_slam_ros.nodes.frontend_node'
+MODULE = 'aim_slam_ros.cli.frontend'
 SMALL = ('-p', f'camera.width:={clips.WIDTH}', '-p', 'publish_tf:=false')
 START_NS = 10 ** 9      # a stamp of 0 is no stamp
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from aim_slam_ros.nodes.keyframe_gaps import KeyframeGaps
+from aim_slam_ros.nodes.loop_closure.keyframe_gaps import KeyframeGaps
 
 
 def gaps_of(*received: int) -> KeyframeGaps:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sensor_msgs.msg import PointCloud2
 
-from aim_slam_ros.nodes.keyframe_pairs import KeyframePairs
+from aim_slam_ros.nodes.loop_closure.keyframe_pairs import KeyframePairs
 
 
 def message(second: int) -> PointCloud2:

@@ -198,9 +198,9 @@ def _arrived(events: list[KeyframeEvent]) -> list[PoseEdge]:
     known: set[int] = set()
     waiting: list[PoseEdge] = []
     arrived = []
-    for event in events:
-        known.add(event.keyframe_id)
-        waiting += event.edges
+    for told in events:
+        known.add(told.keyframe_id)
+        waiting += told.edges
         arrived += [e for e in waiting if {e.a, e.b} <= known]
         waiting = [e for e in waiting if not {e.a, e.b} <= known]
     return arrived

@@ -37,7 +37,7 @@ from msg_adapters.keyframes import keyframe_messages
 from msg_adapters.poses import T_ZUP_OPTICAL, matrix
 from msg_adapters.stamps import stamp_ns
 
-MODULE = 'aim_slam_ros.nodes.loop_closure_node'
+MODULE = 'aim_slam_ros.cli.loop_closure'
 FIRST, SECOND = 11, 22      # sessions
 ROUNDING = 1e-4             # poses travel as float32, coordinates here are below 10
 

@@ -12,8 +12,8 @@ from keyframe_source import image_at
 
 from aim_slam_ros.config import Config
 from aim_slam_ros.datasets.text import read_tum_trajectory
-from aim_slam_ros.nodes.map_files import MapFilesError, save
-from aim_slam_ros.nodes.map_session import MapSession
+from aim_slam_ros.nodes.loop_closure.map_files import MapFilesError, save
+from aim_slam_ros.nodes.loop_closure.map_session import MapSession
 from aim_slam_ros.types import FrameReport
 from msg_adapters.poses import T_ZUP_OPTICAL
 

@@ -6,7 +6,7 @@ import time
 
 from ros_peer import wait_for
 
-from aim_slam_ros.nodes.pacer import Pacer
+from aim_slam_ros.nodes.loop_closure.pacer import Pacer
 
 
 def spend(pacer: Pacer, cost_s: float) -> None:

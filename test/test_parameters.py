@@ -16,8 +16,8 @@ from rclpy.parameter import Parameter
 from ros_peer import Process
 
 from aim_slam_ros.config import Config
-from aim_slam_ros.nodes.frontend_parameters import FrontendParameters
-from aim_slam_ros.nodes.loop_closure_parameters import LoopClosureParameters
+from aim_slam_ros.nodes.frontend.parameters import FrontendParameters
+from aim_slam_ros.nodes.loop_closure.parameters import LoopClosureParameters
 from aim_slam_ros.nodes.parameters import declare_config, declare_section, warn_of_unknown
 from aim_slam_ros.settings import ConfigError
 
@@ -26,7 +26,7 @@ TYPES = {bool: ParameterType.PARAMETER_BOOL, int: ParameterType.PARAMETER_INTEGE
 PROGRAM = """
 import sys
 from rclpy.node import Node
-from aim_slam_ros.nodes.loop_closure_parameters import LoopClosureParameters
+from aim_slam_ros.nodes.loop_closure.parameters import LoopClosureParameters
 from aim_slam_ros.nodes.parameters import declare_config, declare_section, warn_of_unknown
 from aim_slam_ros.nodes.running import run
 

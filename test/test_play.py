@@ -23,7 +23,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from aim_slam_ros.cli.play import main, split_ros_arguments
 from aim_slam_ros.datasets import DatasetError
-from aim_slam_ros.nodes.player import Player, PlayError, PlayOptions, Published
+from aim_slam_ros.nodes.replay.player import Player, PlayError, PlayOptions, Published
 from msg_adapters.encodings import rgb_from_image
 from msg_adapters.stamps import stamp_ns
 

@@ -28,13 +28,13 @@ def _recorded() -> list[np.ndarray]:
     return [cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB) for path in paths]
 
 
-@pytest.mark.parametrize('executable', ['frontend_node', 'slam'])
+@pytest.mark.parametrize('executable', ['frontend', 'slam'])
 def test_real_images_go_through_and_the_node_lives_on(tmp_path: Path, executable: str) -> None:
     recorded, weights = _recorded(), fixture_path('tiny') / 'weights.safetensors'
     settings = {'model.name': 'vggt', 'model.weights': str(weights), 'model.device': 'cpu',
                 'model.infer': 'every_image', 'camera.width': str(WIDTH), 'publish_tf': 'false'}
     arguments = [word for name, value in settings.items() for word in ('-p', f'{name}:={value}')]
-    with Peer() as peer, Process(tmp_path / 'node.log', f'aim_slam_ros.nodes.{executable}',
+    with Peer() as peer, Process(tmp_path / 'node.log', f'aim_slam_ros.cli.{executable}',
                                  '--ros-args', *arguments) as process:
         rows = peer.hear(PointCloud2, 'frame')
         image = peer.publisher(Image, 'image')
@@ -50,7 +50,7 @@ def test_real_images_go_through_and_the_node_lives_on(tmp_path: Path, executable
 
 
 def test_without_weights_it_says_so_and_ends(tmp_path: Path) -> None:
-    with Process(tmp_path / 'node.log', 'aim_slam_ros.nodes.frontend_node', '--ros-args',
+    with Process(tmp_path / 'node.log', 'aim_slam_ros.cli.frontend', '--ros-args',
                  '-p', 'model.name:=vggt', '-p', 'publish_tf:=false') as process:
         assert process.ended() == 2
         assert 'model.weights' in process.output and 'download_weights' in process.output

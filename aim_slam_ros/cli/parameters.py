@@ -12,8 +12,8 @@ from typing import Any, Iterator, Sequence
 import yaml
 
 from aim_slam_ros.config import Config
-from aim_slam_ros.nodes.frontend_parameters import FrontendParameters
-from aim_slam_ros.nodes.loop_closure_parameters import LoopClosureParameters
+from aim_slam_ros.nodes.frontend.parameters import FrontendParameters
+from aim_slam_ros.nodes.loop_closure.parameters import LoopClosureParameters
 from aim_slam_ros.settings import Section, allowed
 
 NODES: dict[str, type[Section]] = {'frontend': FrontendParameters,

@@ -12,7 +12,7 @@ from aim_slam_ros.cli.arguments import Refusal
 from aim_slam_ros.cli.interrupts import INTERRUPTED, one_interrupt
 
 if TYPE_CHECKING:
-    from aim_slam_ros.nodes.player import Player, Published
+    from aim_slam_ros.nodes.replay.player import Player, Published
 
 _CLOCK_HZ = 100.0
 _WAIT_S = 30.0
@@ -105,7 +105,7 @@ def _play(args: argparse.Namespace, for_ros: list[str]) -> int:
     import rclpy
 
     from aim_slam_ros.datasets.base import DatasetError
-    from aim_slam_ros.nodes.player import PlayError
+    from aim_slam_ros.nodes.replay.player import PlayError
     _init(for_ros)
     try:
         _publish(args)
@@ -130,7 +130,7 @@ def _init(for_ros: list[str]) -> None:
 def _publish(args: argparse.Namespace) -> None:
     from rclpy.node import Node
 
-    from aim_slam_ros.nodes.player import Player, PlayOptions
+    from aim_slam_ros.nodes.replay.player import Player, PlayOptions
     options = PlayOptions(args.rate, args.loop, args.start_offset, args.duration, args.clock,
                           tuple(args.topics))
     node = Node('player', start_parameter_services=False, enable_rosout=False)

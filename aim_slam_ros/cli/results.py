@@ -11,14 +11,22 @@ from aim_slam_ros.evaluation import metrics
 from aim_slam_ros.evaluation.metrics import Metric
 from aim_slam_ros.evaluation.reconstruction import write_ply
 from aim_slam_ros.evaluation.report import ReportData, write_report
-from aim_slam_ros.evaluation.run_result import RunResult
+from aim_slam_ros.evaluation.run_result import Run
 from aim_slam_ros.evaluation.trajectory import Incomparable, TrajectoryError, compare
 
-_TABLE = (  # metric, its name for a person, format
+_Rows = tuple[tuple[str, str, str], ...]    # metric, its name for a person, format
+_TRAJECTORY: _Rows = (
     ('ate_rmse_m', 'ATE RMSE, final [m]', '{:.4f}'),
     ('ate_rmse_causal_m', 'ATE RMSE, as reported [m]', '{:.4f}'),
     ('frames_offered', 'images offered', '{}'),
     ('tracked_percent', 'tracked [%]', '{:.1f}'),
+)
+_DELIVERY: _Rows = (
+    ('dropped', 'dropped', '{}'),
+    ('tracked_of_delivered_percent', 'tracked of those not dropped [%]', '{:.1f}'),
+    ('latency', 'latency, median / 95 % / 99 % [ms]', '{}'),
+)
+_MAP: _Rows = (
     ('frames_lost', 'lost', '{}'),
     ('frames_skipped', 'skipped', '{}'),
     ('frames_unreadable', 'unreadable', '{}'),
@@ -28,19 +36,21 @@ _TABLE = (  # metric, its name for a person, format
     ('inferences', 'inferences', '{}'),
     ('mean_window', 'views per inference', '{:.2f}'),
     ('rate_hz', 'rate [images/s]', '{:.1f}'),
-    ('rate_without_model_hz', 'rate without the model [images/s]', '{:.1f}'),
-    ('seed', 'seed', '{}'),
 )
+_WITHOUT_MODEL: _Rows = (
+    ('rate_without_model_hz', 'rate without the model [images/s]', '{:.1f}'),
+)
+_SEED: _Rows = (('seed', 'seed', '{}'),)
 
 
-def write_results(folder: Path, sequence: Sequence, config: Config, run: RunResult) -> None:
+def write_results(folder: Path, sequence: Sequence, config: Config, run: Run) -> None:
     """Write every file and print the table, the report's path last."""
     truth = sequence.groundtruth
     error = compare(run.trajectory, truth) if truth else \
         Incomparable('there is no ground truth')
     figures = metrics.compute(run, truth, error) | {
         'seed': config.seed, 'model': config.model.name, 'dataset': sequence.name}
-    table = _table(figures)
+    table = _table(figures, run)
     write_tum_trajectory(folder / 'trajectory.txt', run.trajectory)
     write_tum_trajectory(folder / 'keyframes.txt', run.keyframe_trajectory)
     write_ply(folder / 'map.ply', run.map_cloud)
@@ -51,11 +61,11 @@ def write_results(folder: Path, sequence: Sequence, config: Config, run: RunResu
     print(folder / 'report.png')
 
 
-def _report(sequence: Sequence, config: Config, run: RunResult,
+def _report(sequence: Sequence, config: Config, run: Run,
             error: TrajectoryError | Incomparable,
             table: tuple[tuple[str, str], ...]) -> ReportData:
     ending = ' (interrupted)' if run.interrupted else ''
-    per_frame_ms = 1e3 / max(run.offered, 1)
+    per_frame_ms = 1e3 / max(metrics.processed(run), 1)
     return ReportData(
         title=f'{sequence.name}, model {config.model.name}{ending}',
         trajectory=run.trajectory, groundtruth=sequence.groundtruth, error=error,
@@ -64,12 +74,24 @@ def _report(sequence: Sequence, config: Config, run: RunResult,
         table=table)
 
 
-def _table(figures: dict[str, Metric]) -> tuple[tuple[str, str], ...]:
-    return tuple((label, '–' if figures[name] is None else form.format(figures[name]))
-                 for name, label, form in _TABLE)
+def _table(figures: dict[str, Metric], run: Run) -> tuple[tuple[str, str], ...]:
+    rows = _TRAJECTORY + _DELIVERY + _MAP + _SEED if run.delivery else \
+        _TRAJECTORY + _MAP + _WITHOUT_MODEL + _SEED
+    shown = figures | _joined(figures) if run.delivery else figures
+    return tuple((label, '–' if shown[name] is None else form.format(shown[name]))
+                 for name, label, form in rows)
 
 
-def _print(run: RunResult, error: TrajectoryError | Incomparable,
+def _joined(figures: dict[str, Metric]) -> dict[str, Metric]:
+    """Figures that share a line of the table."""
+    latencies = [figures[f'latency_ms_{name}'] for name in ('p50', 'p95', 'p99')]
+    share = figures['dropped_percent']
+    return {'dropped': None if share is None else f'{figures["frames_dropped"]} ({share:.1f} %)',
+            'latency': None if None in latencies else
+            ' / '.join(f'{value:.0f}' for value in latencies)}
+
+
+def _print(run: Run, error: TrajectoryError | Incomparable,
            table: tuple[tuple[str, str], ...]) -> None:
     for unreadable in run.unreadable:
         print(f'skipped {unreadable.path}: {unreadable.reason}')

@@ -7,7 +7,8 @@ import math
 from pathlib import Path
 from typing import Mapping, Sequence
 
-from aim_slam_ros.evaluation.run_result import RunResult
+from aim_slam_ros.evaluation.delivery import Delivery
+from aim_slam_ros.evaluation.run_result import Run
 from aim_slam_ros.evaluation.trajectory import (Incomparable, TrajectoryError, compare, during,
                                                 length)
 from aim_slam_ros.types import StampedPoses, TrackingStatus
@@ -16,7 +17,7 @@ Metric = float | int | str | bool | None
 _MODEL_STAGES = ('encode', 'infer')
 
 
-def compute(run: RunResult, groundtruth: StampedPoses | None,
+def compute(run: Run, groundtruth: StampedPoses | None,
             final: TrajectoryError | Incomparable) -> dict[str, Metric]:
     """Every figure that follows from a run; None where it is not available.
 
@@ -28,11 +29,17 @@ def compute(run: RunResult, groundtruth: StampedPoses | None,
         'ate_rmse_causal_m': causal,
         **_counts(run),
         **_rates(run),
+        **(_delivered(run, run.delivery) if run.delivery else {}),
         'trajectory_length_m': _true_length(run, groundtruth),
         'interrupted': run.interrupted,
-        **{f'stage_{name}_ms_per_frame': _ratio(1e3 * seconds, run.offered)
+        **{f'stage_{name}_ms_per_frame': _ratio(1e3 * seconds, processed(run))
            for name, seconds in run.stage_s.items()},
     }
+
+
+def processed(run: Run) -> int:
+    """The images that stage times are divided by: all, or those that were not dropped."""
+    return len(run.results) if run.delivery else run.offered
 
 
 def write(path: Path, metrics: Mapping[str, Metric]) -> None:
@@ -42,7 +49,7 @@ def write(path: Path, metrics: Mapping[str, Metric]) -> None:
     path.write_text(json.dumps(clean, indent=2, allow_nan=False) + '\n', encoding='utf-8')
 
 
-def _counts(run: RunResult) -> dict[str, Metric]:
+def _counts(run: Run) -> dict[str, Metric]:
     """A frame is tracked only when its pose belongs to the largest connected map.
 
     frames_late: of them, those that waited for the map to begin and were placed afterwards.
@@ -53,7 +60,7 @@ def _counts(run: RunResult) -> dict[str, Metric]:
         'frames_offered': run.offered,
         'frames_tracked': tracked,
         'tracked_percent': _ratio(100.0 * tracked, run.offered),
-        'frames_late': sum(len(result.late) for result in run.results),
+        'frames_late': run.late,
         'frames_skipped': run.count(TrackingStatus.SKIPPED),
         'frames_unreadable': len(run.unreadable),
         'frames_lost': run.count(TrackingStatus.LOST),
@@ -61,7 +68,7 @@ def _counts(run: RunResult) -> dict[str, Metric]:
         'map_pieces': len({keyframe.piece_id for keyframe in run.keyframes}),
         'map_points': len(run.map_cloud.points),
         'keyframes': len(run.keyframes),
-        'loops': len(run.loops),
+        'loops': run.loop_count,
         'inferences': sum(result.inferences for result in run.results),
         'rotation_only_inferences': run.rotation_only_inferences,
         'mean_window': _mean([len(r.window) + 1 for r in run.results if r.window]),
@@ -70,15 +77,32 @@ def _counts(run: RunResult) -> dict[str, Metric]:
     }
 
 
-def _rates(run: RunResult) -> dict[str, Metric]:
-    """Frames per second from the first image read to the last result, with and without model."""
+def _rates(run: Run) -> dict[str, Metric]:
+    """Frames per second from the first image read to the last result, with and without model.
+
+    Over topics the model works beside everything else: there is no time without it.
+    """
     model_s = sum(run.stage_s.get(name, 0.0) for name in _MODEL_STAGES)
+    without = None if run.delivery else _ratio(run.offered, run.wall_s - model_s)
     return {'wall_s': run.wall_s,
             'rate_hz': _ratio(run.offered, run.wall_s),
-            'rate_without_model_hz': _ratio(run.offered, run.wall_s - model_s)}
+            'rate_without_model_hz': without}
 
 
-def _true_length(run: RunResult, groundtruth: StampedPoses | None) -> float | None:
+def _delivered(run: Run, delivery: Delivery) -> dict[str, Metric]:
+    """An image that nothing was said about was dropped: a newer one came while it waited."""
+    delivered = len(run.results)
+    dropped = run.offered - delivered
+    return {
+        'frames_delivered': delivered,
+        'frames_dropped': dropped,
+        'dropped_percent': _ratio(100.0 * dropped, run.offered),
+        'tracked_of_delivered_percent': _ratio(100.0 * len(run.tracked), delivered),
+        **delivery.figures(),
+    }
+
+
+def _true_length(run: Run, groundtruth: StampedPoses | None) -> float | None:
     """How far the camera really moved while the images were taken."""
     if groundtruth is None or not run.results:
         return None

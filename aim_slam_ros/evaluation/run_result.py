@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from aim_slam_ros.evaluation.delivery import Delivery
 from aim_slam_ros.geometry import sim3
 from aim_slam_ros.types import Cloud, FrameResult, StampedPoses, TrackingStatus
 
@@ -42,13 +44,13 @@ class LoopPair:
 
 
 @dataclass(frozen=True)
-class RunResult:
+class Run(ABC):
     """Everything a run produced; of an interrupted run, everything until then.
 
-    results: one for every readable image, in time order. offered: images asked for, readable or
-    not. wall_s: from the first image read to the last result, without building the model.
-    stage_s: seconds in each stage over the whole run, reading and loop closure included.
-    map_cloud: fused, in the world frame.
+    results: one for every image that was answered, in time order. offered: images asked for,
+    readable or not. wall_s: from the first image read to the last result, without building the
+    model. stage_s: seconds in each stage over the whole run. map_cloud: fused, in the world
+    frame. rotation_only_inferences: None where nobody counted them.
     """
 
     results: tuple[FrameResult, ...]
@@ -57,14 +59,43 @@ class RunResult:
     wall_s: float
     stage_s: Mapping[str, float]
     keyframes: tuple[PlacedKeyframe, ...]
-    loops: tuple[LoopPair, ...]
     map_cloud: Cloud
-    rotation_only_inferences: int
+    rotation_only_inferences: int | None
     interrupted: bool
 
+    @property
+    @abstractmethod
+    def trajectory(self) -> StampedPoses:
+        """The tracked frames where they ended up."""
+
+    @property
+    @abstractmethod
+    def causal_trajectory(self) -> StampedPoses:
+        """The tracked frames with the pose that was reported at the time."""
+
+    @property
+    @abstractmethod
+    def late(self) -> int:
+        """Images that waited for the map to begin and were placed in it afterwards."""
+
+    @property
+    @abstractmethod
+    def loop_count(self) -> int:
+        """Loops that were closed."""
+
+    @property
+    @abstractmethod
+    def delivery(self) -> Delivery | None:
+        """How images and poses travelled; None for a run within one process."""
+
     @cached_property
-    def _keyframe(self) -> dict[int, PlacedKeyframe]:
-        return {keyframe.keyframe_id: keyframe for keyframe in self.keyframes}
+    def keyframe_trajectory(self) -> StampedPoses:
+        """The keyframes of the largest connected map, without their scales."""
+        if not self.pieces:
+            return stamped(())
+        (largest, _), = self.pieces.most_common(1)
+        return stamped((k.stamp_ns, sim3.rigid_part(k.T_world_kf)) for k in sorted(
+            self.keyframes, key=lambda k: k.stamp_ns) if k.piece_id == largest)
 
     @cached_property
     def pieces(self) -> Counter[int]:
@@ -79,28 +110,12 @@ class RunResult:
         (largest, _), = self.pieces.most_common(1)
         return tuple(r for r in self._with_pose if self._piece(r) == largest)
 
-    @cached_property
-    def trajectory(self) -> StampedPoses:
-        """Every tracked frame, from its keyframe's final pose."""
-        return _stamped((r.stamp_ns, self._final_pose(r)) for r in self.tracked)
-
-    @cached_property
-    def causal_trajectory(self) -> StampedPoses:
-        """The same frames, with the pose that was reported at the time."""
-        return _stamped((r.stamp_ns, r.T_world_cam) for r in self.tracked
-                        if r.T_world_cam is not None)
-
-    @cached_property
-    def keyframe_trajectory(self) -> StampedPoses:
-        """The keyframes of the largest connected map, without their scales."""
-        if not self.pieces:
-            return _stamped(())
-        (largest, _), = self.pieces.most_common(1)
-        return _stamped((k.stamp_ns, sim3.rigid_part(k.T_world_kf)) for k in sorted(
-            self.keyframes, key=lambda k: k.stamp_ns) if k.piece_id == largest)
-
     def count(self, status: TrackingStatus) -> int:
         return sum(result.status is status for result in self.results)
+
+    @cached_property
+    def _keyframe(self) -> dict[int, PlacedKeyframe]:
+        return {keyframe.keyframe_id: keyframe for keyframe in self.keyframes}
 
     @cached_property
     def _with_pose(self) -> list[FrameResult]:
@@ -111,13 +126,47 @@ class RunResult:
         assert result.reference_id is not None
         return self._keyframe[result.reference_id].piece_id
 
+
+@dataclass(frozen=True)
+class RunResult(Run):
+    """A run within this process, where every image was processed in turn.
+
+    results: one for every readable image. stage_s: reading and loop closure included.
+    """
+
+    loops: tuple[LoopPair, ...]
+
+    @cached_property
+    def trajectory(self) -> StampedPoses:
+        """Every tracked frame, from its keyframe's final pose."""
+        return stamped((r.stamp_ns, self._final_pose(r)) for r in self.tracked)
+
+    @cached_property
+    def causal_trajectory(self) -> StampedPoses:
+        """The same frames, with the pose that was reported at the time."""
+        return stamped((r.stamp_ns, r.T_world_cam) for r in self.tracked
+                       if r.T_world_cam is not None)
+
+    @property
+    def late(self) -> int:
+        return sum(len(result.late) for result in self.results)
+
+    @property
+    def loop_count(self) -> int:
+        return len(self.loops)
+
+    @property
+    def delivery(self) -> None:
+        """Nothing travelled."""
+
     def _final_pose(self, result: FrameResult) -> Tensor:
         """[4,4] float64, rigid: T_world_kf T_kf_cam; the keyframe's scale moves it, no more."""
         assert result.reference_id is not None and result.T_kf_cam is not None
         return sim3.rigid_part(self._keyframe[result.reference_id].T_world_kf @ result.T_kf_cam)
 
 
-def _stamped(poses: Iterable[tuple[int, Tensor]]) -> StampedPoses:
+def stamped(poses: Iterable[tuple[int, Tensor]]) -> StampedPoses:
+    """Poses in the order given; T_world_cam [4,4] float64, rigid, for each stamp [ns]."""
     pairs = list(poses)
     if not pairs:
         return StampedPoses(np.zeros(0, np.int64), np.zeros((0, 4, 4)))

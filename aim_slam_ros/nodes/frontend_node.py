@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any, Callable
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -18,14 +17,13 @@ from msg_adapters.errors import MessageError
 from ..models import make_model
 from ..models.base import GeometryModel
 from ..types import TrackingStatus
-from .frontend_output import FrontendOutput
-from .frontend_parameters import FrontendParameters
-from .frontend_statistics import FrontendStatistics
-from .frontend_worker import FrontendWorker
-from .image_input import CameraInfoInput, ImageInput
-from .loop_closure_parameters import LoopClosureParameters
+from .frontend.image_input import CameraInfoInput, ImageInput
+from .frontend.output import FrontendOutput
+from .frontend.parameters import FrontendParameters
+from .frontend.statistics import FrontendStatistics
+from .frontend.worker import FrontendWorker
+from .loop_closure.parameters import LoopClosureParameters
 from .parameters import declare_config, declare_section, warn_of_unknown
-from .running import run
 
 
 class FrontendNode(Node):
@@ -98,12 +96,3 @@ class FrontendNode(Node):
         if last.status is TrackingStatus.TRACKED:
             return DiagnosticStatus.OK, 'tracked'
         return DiagnosticStatus.WARN, f'{last.status.value}: {last.reason}'
-
-
-def main(argv: list[str] | None = None) -> int:
-    """The executable ``frontend``."""
-    return run(FrontendNode, argv)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from typing import Any
 
@@ -20,17 +19,16 @@ from msg_adapters.errors import MessageError
 
 from ..models import make_model
 from ..models.base import GeometryModel
-from .frontend_parameters import FrontendParameters
-from .keyframe_pairs import KeyframePair, KeyframePairs
-from .loop_closure_output import LoopClosureOutput
-from .loop_closure_parameters import LoopClosureParameters
-from .loop_closure_statistics import LoopClosureStatistics, map_values
-from .map_files import MapFilesError
-from .map_sessions import MapSessions
-from .map_worker import MapWorker
+from .frontend.parameters import FrontendParameters
+from .loop_closure.keyframe_pairs import KeyframePair, KeyframePairs
+from .loop_closure.map_files import MapFilesError
+from .loop_closure.map_sessions import MapSessions
+from .loop_closure.map_worker import MapWorker
+from .loop_closure.output import LoopClosureOutput
+from .loop_closure.parameters import LoopClosureParameters
+from .loop_closure.resend_requests import ResendRequests
+from .loop_closure.statistics import LoopClosureStatistics, map_values
 from .parameters import declare_config, declare_section, warn_of_unknown
-from .resend_requests import ResendRequests
-from .running import run
 
 _MANY_PENDING = 10      # so many waiting keyframes are worth a warning
 _PERIOD_S = 5.0         # a complaint about messages is repeated this often at most
@@ -164,12 +162,3 @@ class LoopClosureNode(Node):
         self.create_subscription(
             PointCloud2, topic, callback, QoSProfile(depth=depth),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
-
-
-def main(argv: list[str] | None = None) -> int:
-    """The executable ``loop_closure``."""
-    return run(LoopClosureNode, argv)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

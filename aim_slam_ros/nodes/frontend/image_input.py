@@ -16,7 +16,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from msg_adapters.encodings import K_from_camera_info, has_distortion
 from msg_adapters.errors import MessageError
 
-from .frontend_parameters import FrontendParameters
+from .parameters import FrontendParameters
 
 _LOOK_S = 0.2    # how often it is looked whether something is amiss
 
@@ -41,7 +41,7 @@ class ImageInput:
         self._topic = 'image/compressed' if self._compressed else 'image'
         self._switch = False
         self._last_s = time.monotonic()
-        self._silent = False
+        self._silent, self._said = False, ''
         self._subscribe(parameters.image_reliability != 'best_effort')
         node.create_timer(_LOOK_S, self._look)
 
@@ -67,7 +67,7 @@ class ImageInput:
                 [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH]))
 
     def _take(self, message: Any) -> None:
-        self._last_s, self._silent = time.monotonic(), False
+        self._last_s = time.monotonic()
         self._on_image(ArrivedImage(message, self._last_s))
 
     def _incompatible(self, event: Any) -> None:
@@ -89,9 +89,14 @@ class ImageInput:
                 'if images are lost on the way, give Fast DDS more shared memory '
                 '(config/fastdds_shm.xml)')
         waited_s = time.monotonic() - self._last_s
-        if waited_s >= self._parameters.image_timeout_s and not self._silent:
-            self._silent = True
-            self._node.get_logger().warning(f'no image for {waited_s:.1f} s; {self._why()}')
+        self._silent = waited_s >= self._parameters.image_timeout_s
+        if not self._silent:
+            self._said = ''
+            return
+        why = self._why()
+        if why != self._said:   # once, and again when there is news
+            self._said = why
+            self._node.get_logger().warning(f'no image for {waited_s:.1f} s; {why}')
 
     def _why(self) -> str:
         topic = self._subscription.topic_name

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..config import Config
-from ..geometry import sim3
-from ..loop_closure.corrected_path import CorrectedPath
-from ..loop_closure.map_from_odom import MapFromOdom
-from ..loop_closure.pipeline import LoopClosurePipeline
-from ..models.base import GeometryModel
-from ..types import Cloud, CorrectedKeyframes, FrameReport, KeyframeEvent, StampedPoses
+from ...config import Config
+from ...geometry import sim3
+from ...loop_closure.corrected_path import CorrectedPath
+from ...loop_closure.map_from_odom import MapFromOdom
+from ...loop_closure.pipeline import LoopClosurePipeline
+from ...models.base import GeometryModel
+from ...types import Cloud, CorrectedKeyframes, FrameReport, KeyframeEvent, StampedPoses
 from .keyframe_gaps import KeyframeGaps
 
 

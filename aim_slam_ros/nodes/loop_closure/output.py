@@ -16,12 +16,12 @@ from visualization_msgs.msg import MarkerArray
 from msg_adapters import clouds, keyframes, markers, poses
 from msg_adapters.serialised_path import serialised_path
 
-from ..geometry import sim3
-from ..types import CorrectedKeyframes
-from .loop_closure_parameters import LoopClosureParameters
+from ...geometry import sim3
+from ...types import CorrectedKeyframes
+from ..transforms import Transforms
 from .map_files import z_up, z_up_cloud
 from .map_session import MapSession
-from .transforms import Transforms
+from .parameters import LoopClosureParameters
 
 
 class LoopClosureOutput:

@@ -10,11 +10,11 @@ import torch
 
 from msg_adapters.poses import T_ZUP_OPTICAL
 
-from ..config import Config
-from ..datasets.text import write_tum_trajectory
-from ..evaluation.reconstruction import write_ply
-from ..geometry import sim3
-from ..types import Cloud, StampedPoses
+from ...config import Config
+from ...datasets.text import write_tum_trajectory
+from ...evaluation.reconstruction import write_ply
+from ...geometry import sim3
+from ...types import Cloud, StampedPoses
 from .map_session import MapSession
 
 

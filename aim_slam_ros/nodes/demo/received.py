@@ -13,10 +13,11 @@ from torch import Tensor
 from msg_adapters import clouds, frames, keyframes, poses
 from msg_adapters.stamps import stamp_ns
 
-from ..evaluation.delivery import Delivery, Traffic
-from ..evaluation.received_run import ReceivedRun
-from ..evaluation.run_result import PlacedKeyframe, stamped
-from ..types import Cloud, FrameReport, FrameResult, StampedPoses, TrackingStatus
+from ...evaluation.delivery import Delivery, Traffic
+from ...evaluation.received_run import ReceivedRun
+from ...evaluation.run_result import PlacedKeyframe, stamped
+from ...geometry import sim3
+from ...types import Cloud, FrameReport, FrameResult, StampedPoses, TrackingStatus
 from .collector import Heard, Topic
 from .overview import LOOP_CLOSURE, newest_status
 
@@ -39,7 +40,7 @@ class Playback:
 def received_run(topics: Mapping[str, Topic], playback: Playback) -> ReceivedRun:
     """Everything that was heard until now; the last session's map counts."""
     rows = FrameRows(topics['frame'])
-    results = rows.results
+    results, path = rows.results, _path(topics['path'])
     first_ns = min(playback.published_ns.values(), default=0)
     stage_s: defaultdict[str, float] = defaultdict(float)
     for result in results:
@@ -48,9 +49,10 @@ def received_run(topics: Mapping[str, Topic], playback: Playback) -> ReceivedRun
     return ReceivedRun(
         results=results, unreadable=(), offered=playback.images,
         wall_s=max(rows.last_arrival_ns - first_ns, 0) / 1e9, stage_s=dict(stage_s),
-        keyframes=_keyframes(topics, rows.session_id), map_cloud=_map(topics['map']),
+        keyframes=_keyframes(topics, rows.session_id, path), map_cloud=_map(topics['map']),
         rotation_only_inferences=None, interrupted=playback.interrupted,
-        path=_path(topics['path']), reported=_reported(topics['pose']),
+        path=stamped(sorted(path.items(), key=lambda item: item[0])),
+        reported=_reported(topics['pose']),
         placed_late=len(rows.late),
         loops_closed=int(newest_status(topics, LOOP_CLOSURE).values.get('loops', 0)),
         travelled=_delivery(topics, playback, rows))
@@ -104,11 +106,39 @@ def _later(before: FrameResult, after: FrameResult) -> FrameResult:
         kappa=before.kappa if after.kappa is None else after.kappa)
 
 
-def _keyframes(topics: Mapping[str, Topic],
-               session_id: int | None) -> tuple[PlacedKeyframe, ...]:
-    """Where each keyframe was said to be last; loop closure's word after the frontend's."""
+def _keyframes(topics: Mapping[str, Topic], session_id: int | None,
+               path: Mapping[int, Tensor]) -> tuple[PlacedKeyframe, ...]:
+    """Where each keyframe was said to be last; path: T_world_cam of images, by stamp."""
+    told = _told_by_frontend(topics['keyframe'], session_id)
+    message = topics['keyframe_poses'].read_newest()
+    received = None if message is None else keyframes.correction(message)
+    if received is None or received.session_id != session_id:
+        return tuple(told[keyframe_id] for keyframe_id in sorted(told))
+    pieces = received.corrected.pieces
+    joined = {told[k].piece_id: piece for k, piece in pieces.items() if k in told}
+    placed = {k: _as_corrected(keyframe, joined, path) for k, keyframe in told.items()}
+    placed |= {p.keyframe_id: PlacedKeyframe(p.keyframe_id, pieces[p.keyframe_id],
+                                             received.stamps_ns[p.keyframe_id], p.T_world_kf)
+               for p in received.corrected.poses}
+    return tuple(placed[keyframe_id] for keyframe_id in sorted(placed))
+
+
+def _as_corrected(keyframe: PlacedKeyframe, joined: Mapping[int, int],
+                  path: Mapping[int, Tensor]) -> PlacedKeyframe:
+    """A keyframe that the correction lacks; it may be told of in the world before it.
+
+    Loop closure's word about its image is newer. joined: what became of each map piece.
+    """
+    T_world_kf = keyframe.T_world_kf
+    if keyframe.stamp_ns in path:
+        T_world_kf = sim3.with_scale(path[keyframe.stamp_ns], sim3.scale_of(T_world_kf))
+    return replace(keyframe, T_world_kf=T_world_kf,
+                   piece_id=joined.get(keyframe.piece_id, keyframe.piece_id))
+
+
+def _told_by_frontend(topic: Topic, session_id: int | None) -> dict[int, PlacedKeyframe]:
+    """By id: the newest of its own message and of those that moved it."""
     placed: dict[int, PlacedKeyframe] = {}
-    topic = topics['keyframe']
     for heard in topic.heard:
         table = keyframes.keyframe_placement(topic.read(heard))
         if table.session_id != session_id:
@@ -120,14 +150,7 @@ def _keyframes(topics: Mapping[str, Topic],
             if pose.keyframe_id in placed:
                 placed[pose.keyframe_id] = replace(placed[pose.keyframe_id],
                                                    T_world_kf=pose.T_world_kf)
-    message = topics['keyframe_poses'].read_newest()
-    received = None if message is None else keyframes.correction(message)
-    if received is not None and received.session_id == session_id:
-        for pose in received.corrected.poses:
-            known = pose.keyframe_id
-            placed[known] = PlacedKeyframe(known, received.corrected.pieces.get(known, 0),
-                                           received.stamps_ns[known], pose.T_world_kf)
-    return tuple(placed[keyframe_id] for keyframe_id in sorted(placed))
+    return placed
 
 
 def _camera_pose(T_zup_cam: Tensor) -> Tensor:
@@ -135,12 +158,12 @@ def _camera_pose(T_zup_cam: Tensor) -> Tensor:
     return _T_OPTICAL_ZUP @ T_zup_cam
 
 
-def _path(topic: Topic) -> StampedPoses:
+def _path(topic: Topic) -> dict[int, Tensor]:
+    """T_world_cam by stamp."""
     message = topic.read_newest()
-    placed = {} if message is None else {
+    return {} if message is None else {
         stamp_ns(pose.header.stamp): _camera_pose(poses.matrix(pose.pose))
         for pose in message.poses}
-    return stamped(sorted(placed.items(), key=lambda item: item[0]))
 
 
 def _reported(topic: Topic) -> StampedPoses:

@@ -15,11 +15,12 @@ import yaml
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from ..datasets.bag_topics import COMPRESSED, ChosenTopics
-from ..evaluation.received_run import ReceivedRun
+from ...datasets.bag_topics import COMPRESSED, ChosenTopics
+from ...datasets.base import DatasetError
+from ...evaluation.received_run import ReceivedRun
+from ..replay.player import Player, PlayError, PlayOptions, Published
 from .collector import Collector
 from .overview import NOTHING, Overview, overview
-from .player import Player, PlayOptions, Published
 from .processes import NodeProcess, executable, stop
 from .received import Playback, received_run
 from .settling import frontend_is_idle, loop_closure_is_idle
@@ -45,13 +46,13 @@ class LiveBag:
 
 @dataclass(frozen=True)
 class LiveResult:
-    """run: what was heard. died: why the run could not go on, or None.
+    """run: what was heard. failure: why the run could not go on, or None.
 
     problems: what a person should know besides, one line each.
     """
 
     run: ReceivedRun
-    died: str | None
+    failure: str | None
     problems: tuple[str, ...]
 
 
@@ -71,7 +72,8 @@ def run_live(bag: LiveBag, settings: Mapping[str, Any], out: Path, rate: float,
 
     settings: parameters of both nodes, nested by section. out: gets parameters.yaml and the logs.
     rate: times real time. Ctrl-C (KeyboardInterrupt) ends the playing; what was heard until then
-    is returned. The ROS domain is that of the environment. Raises PlayError and DatasetError.
+    is returned. The ROS domain is that of the environment. Raises PlayError and DatasetError for
+    a bag that cannot be played at all.
     """
     parameters = _write_parameters(out / 'parameters.yaml', bag, settings)
     arguments = ['--ros-args', '--params-file', str(parameters)]
@@ -128,8 +130,7 @@ class _LiveRun:
         self._node = _player_node(bag.topics)
         self._image_topic = _image_topic(bag.topics)
         names = tuple(t.name for t in (bag.topics.image, bag.topics.camera_info) if t)
-        self._player = Player(self._node, bag.path,
-                              PlayOptions(rate=rate, topics=names))
+        self._player = Player(self._node, bag.path, PlayOptions(rate=rate, topics=names))
         # Set with the last image: the player would wait for it to be acknowledged, and while it
         # does so no other thread of this process can take a message.
         self._played = threading.Event()
@@ -140,23 +141,23 @@ class _LiveRun:
 
     def result(self) -> LiveResult:
         """Play, wait for the end of the work, end the nodes."""
-        interrupted, died = False, None
+        interrupted, failure = False, None
         try:
             self._await_nodes()
             self._player.play(self._take, self._played)
             self._settle()
         except KeyboardInterrupt:
             interrupted = True
-        except NodeDied as death:
-            died = str(death)
+        except (NodeDied, PlayError, DatasetError) as error:
+            failure = str(error)
         ended = stop(self._processes)
-        if died is None:
+        if failure is None:
             self._problems += [end.problem for end in ended if end.problem]
         self._collector.close()
         self._player.close()
         self._node.destroy_node()
         played = Playback(self._published_ns, self._images, interrupted)
-        return LiveResult(received_run(self._topics, played), died, tuple(self._problems))
+        return LiveResult(received_run(self._topics, played), failure, tuple(self._problems))
 
     def _take(self, published: Published) -> None:
         """An image has left."""

@@ -23,8 +23,8 @@ from rosgraph_msgs.msg import Clock
 
 from msg_adapters.stamps import stamp_msg
 
-from ..datasets.bag_topics import COMPRESSED, IMAGE
-from ..datasets.bags import Bag, BagMessage, BagTopic, header_stamp_ns
+from ...datasets.bag_topics import COMPRESSED, IMAGE
+from ...datasets.bags import Bag, BagMessage, BagTopic, header_stamp_ns
 from .pace import Pace
 from .read_ahead import ReadAhead
 from .subscribers import wait_for_subscriber, what_is_subscribed

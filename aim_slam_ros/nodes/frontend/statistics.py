@@ -8,8 +8,8 @@ import time
 from collections import Counter, deque
 from typing import Iterable
 
-from ..types import FrameResult, TrackingStatus
-from .memory import memory_mb
+from ...types import FrameResult, TrackingStatus
+from ..memory import memory_mb
 
 _SPAN_S = 5.0       # rates and latencies are of so many last seconds
 

@@ -17,14 +17,14 @@ from msg_adapters.errors import MessageError
 from msg_adapters.keyframes import ReceivedCorrection
 from msg_adapters.stamps import stamp_ns
 
-from ..config import Config
-from ..frontend.concurrent import ConcurrentFrontend, PlacedResult
-from ..models.base import GeometryModel
-from ..types import FrameResult, TrackingStatus
-from .frontend_output import FrontendOutput
-from .frontend_parameters import FrontendParameters
-from .frontend_statistics import FrontendStatistics
+from ...config import Config
+from ...frontend.concurrent import ConcurrentFrontend, PlacedResult
+from ...models.base import GeometryModel
+from ...types import FrameResult, TrackingStatus
 from .image_input import ArrivedImage
+from .output import FrontendOutput
+from .parameters import FrontendParameters
+from .statistics import FrontendStatistics
 
 _BACKWARDS_NS = 500_000_000   # so far back in time is another beginning, not a late image
 _PERIOD_S = 5.0               # a complaint about images is repeated this often at most

@@ -5,13 +5,13 @@ from __future__ import annotations
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.task import Future
 
-from ..config import Config
-from ..models.base import GeometryModel
-from .loop_closure_output import LoopClosureOutput
-from .loop_closure_parameters import LoopClosureParameters
+from ...config import Config
+from ...models.base import GeometryModel
 from .map_files import MapFilesError
 from .map_session import MapSession
 from .map_worker import MapWorker
+from .output import LoopClosureOutput
+from .parameters import LoopClosureParameters
 
 
 class MapSessions:

@@ -6,8 +6,8 @@ import threading
 from collections import deque
 from typing import Iterator
 
-from ..datasets.base import DatasetError
-from ..datasets.bags import BagMessage
+from ...datasets.bags import BagMessage
+from ...datasets.base import DatasetError
 
 _BUDGET_BYTES = 64 << 20    # some seconds of a VGA camera
 _JOIN_S = 1.0               # a chunk of a bag takes less

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..settings import Section, setting
+from ...settings import Section, setting
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from msg_adapters import clouds, frames, keyframes, poses
 
-from ..frontend.concurrent import PlacedResult
-from ..geometry import sim3
-from ..types import FrameReport, KeyframeEvent
-from .frontend_parameters import FrontendParameters
-from .transforms import Transforms
+from ...frontend.concurrent import PlacedResult
+from ...geometry import sim3
+from ...types import FrameReport, KeyframeEvent
+from ..transforms import Transforms
+from .parameters import FrontendParameters
 
 _NO_FRAME = 'camera_optical_frame'
 

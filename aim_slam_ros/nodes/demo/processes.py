@@ -112,7 +112,7 @@ def executable(name: str) -> list[str]:
     for folder in _executables():
         if (folder / name).is_file():
             return [sys.executable, str(folder / name)]
-    return [sys.executable, '-m', f'{_PACKAGE}.nodes.{name}_node']
+    return [sys.executable, '-m', f'{_PACKAGE}.cli.{name}']
 
 
 def _executables() -> list[Path]:

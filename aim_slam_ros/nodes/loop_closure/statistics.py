@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 
+from ..memory import memory_mb
 from .map_session import MapSession
-from .memory import memory_mb
 
 
 class LoopClosureStatistics:

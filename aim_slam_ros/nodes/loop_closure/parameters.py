@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..settings import ConfigError, Section, setting
+from ...settings import ConfigError, Section, setting
 
 
 @dataclass(frozen=True)

@@ -13,16 +13,16 @@ from typing import Callable
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.task import Future
 
-from ..config import Config
-from ..loop_closure.pose_graph import PoseGraphError
-from ..loop_closure.retrieval import RetrievalError
-from ..types import KeyframeEvent
-from .loop_closure_output import LoopClosureOutput
-from .loop_closure_parameters import LoopClosureParameters
-from .loop_closure_statistics import LoopClosureStatistics
+from ...config import Config
+from ...loop_closure.pose_graph import PoseGraphError
+from ...loop_closure.retrieval import RetrievalError
+from ...types import KeyframeEvent
 from .map_files import MapFilesError, save
 from .map_session import MapSession
+from .output import LoopClosureOutput
 from .pacer import Pacer
+from .parameters import LoopClosureParameters
+from .statistics import LoopClosureStatistics
 
 _CAPACITY = 100         # keyframes that may wait, some megabytes each; the frontend has them all
 _TICK_S = 0.1           # how often it looks whether something is due
