@@ -13,7 +13,7 @@ from typing import Callable
 
 import pytest
 
-from aim_slam_ros.nodes import domains
+from aim_slam_ros.nodes.demo import domains
 from aim_slam_ros.nodes.demo.processes import NodeProcess, executable, stop
 
 ROOT = Path(__file__).resolve().parents[1]
