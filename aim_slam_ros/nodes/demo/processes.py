@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Iterable, Mapping, Sequence
 
+import aim_slam_ros
+
 _PACKAGE = 'aim_slam_ros'
 _LIBC = ctypes.CDLL(None)
 _PR_SET_PDEATHSIG = 1
@@ -125,7 +127,8 @@ def _executables() -> list[Path]:
 
 def _with_package(environment: Mapping[str, str]) -> dict[str, str]:
     """The environment in which the child imports the package that this process runs."""
-    root = str(Path(__file__).resolve().parents[2])
+    assert aim_slam_ros.__file__ is not None
+    root = str(Path(aim_slam_ros.__file__).resolve().parents[1])
     path = environment.get('PYTHONPATH')
     return {**environment, 'PYTHONPATH': os.pathsep.join([root, *([path] if path else [])])}
 
