@@ -27,7 +27,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from aim_slam_ros.types import KeyframeEvent
 from msg_adapters import encodings, images, keyframes
 
-RATE = 0.5              # 15 images per second: what two cores manage for every image
+RATE = 0.3              # 9 images per second: what two cores manage for every image
 SLOW_RATE = 1.0
 RECORDINGS = ('tum_fr1_xyz', 'redkitchen_600')
 PARTS = ('messages', 'slow_model', *RECORDINGS)

@@ -183,6 +183,7 @@ def test_a_restarted_frontend_begins_a_new_map(tmp_path: Path, clip: Clip) -> No
                        for row in again.rows)
             loop_closure.says('new map')
             wait_for(lambda: list(saved.glob('*/map.ply')), 'the old map')
+            again.walk(clip, range(20, 26), later_ns=10 ** 10)  # by now they know each other
             wait_for(lambda: again.corrected, 'a corrected pose in the new map')
             started = time.monotonic()
             for process in (frontend, loop_closure):
