@@ -42,7 +42,8 @@ class Admission:
             return f'the image is too small: {width}x{height}'
         if self._size is not None and self._size != (height, width):
             return (f'the image is {width}x{height}, '
-                    f'but the map was begun with {self._size[1]}x{self._size[0]}')
+                    f'but the map was begun with {self._size[1]}x{self._size[0]}: reset to begin '
+                    'another')
         if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
             return f'its stamp {stamp_ns} ns is not newer than the last, {self._stamp_ns} ns'
         # Every fourth pixel tells a black or constant image as well as all of them do.
