@@ -70,7 +70,8 @@ benchmark: OUT ?= out/benchmark
 benchmark: $(READY)
 	@for part in offline ros; do $(BIN)/python benchmark/$$part.py \
 	--data $(call quoted,$(DATA)) --out $(call quoted,$(OUT)) || exit 1; done
-	@$(BIN)/python benchmark/vggt.py --out $(call quoted,$(OUT))
+	@for part in frontend vggt; do $(BIN)/python benchmark/$$part.py \
+	--out $(call quoted,$(OUT)) || exit 1; done
 
 parameters: $(READY)
 	@$(BIN)/python -m aim_slam_ros.cli.parameters config

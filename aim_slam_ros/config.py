@@ -32,7 +32,10 @@ class CameraConfig(Section):
 
 @dataclass(frozen=True)
 class ModelConfig(Section):
-    name: str = setting('classical', 'the geometry model', choices=('classical', 'vggt'))
+    name: str = setting(
+        'classical', 'the geometry model; simulated answers from recorded depth and poses, with '
+        'the errors of simulated.preset, and only in evaluate',
+        choices=('classical', 'vggt', 'simulated'))
     weights: str = setting('', 'the file with the weights of vggt, or its folder')
     device: str = setting(
         'auto', 'where vggt runs: auto (the GPU where there is one), cpu, cuda or cuda:N')
@@ -68,9 +71,21 @@ class VggtConfig(Section):
 
 
 @dataclass(frozen=True)
+class SimulatedConfig(Section):
+    preset: str = setting(
+        'vggt', 'errors of the simulated model: those of a foundation model, half, twice as '
+        'large, or with the same depth warp in all inferences of an image',
+        choices=('vggt', 'mild', 'harsh', 'correlated'))
+
+
+@dataclass(frozen=True)
 class SigmaConfig(Section):
     """Choice of the window's keyframes (SIGMA)."""
 
+    prioritiser: str = setting(
+        'information', 'which keyframes join first: those that see the same, by how much they '
+        'inform about it (SIGMA), or the newest (for comparison)',
+        choices=('information', 'recency'))
     voxel_fraction: float = setting(
         0.06, "voxel size as a fraction of the first keyframe's median depth", 0.005, 1)
     voxel_quantile: float = setting(
@@ -90,7 +105,10 @@ class SigmaConfig(Section):
         0.15, 'relative depth difference above which a candidate does not see a point', 0.001, 1)
     kappa: float = setting(
         1.0, 'reduced chi-square above which another keyframe joins the window', 0)
-    max_window: int = setting(5, 'views of a window, the current frame included', 2, 20)
+    min_window: int = setting(
+        3, 'views that a window starts from, the current frame included', 2, 20)
+    max_window: int = setting(
+        5, 'views that a window has at most, however many it starts from', 2, 20)
 
 
 @dataclass(frozen=True)
@@ -98,7 +116,8 @@ class JointTrackingConfig(Section):
     """The paper's joint solve (``tracker: paper``)."""
 
     residual: str = setting(
-        'hybrid', 'what is compared besides log-distances', choices=('ray', 'pixel', 'hybrid'))
+        'hybrid', 'what is compared besides log-distances',
+        choices=('ray', 'projection', 'hybrid'))
     pairs: str = setting(
         'composed', 'neighbouring views only, or also those with one view between them',
         choices=('adjacent', 'composed'))
@@ -171,7 +190,7 @@ class TrackingConfig(Section):
     tracker: str = setting(
         'image', "refine matches in the images, or the paper's joint Sim(3) solve",
         choices=('image', 'paper'))
-    stride: int = setting(12, 'every so many pixels of a keyframe are matched [px]', 1, 64)
+    stride: int = setting(16, 'every so many pixels of a keyframe are matched [px]', 1, 64)
     sigma_px: float = setting(
         1.0, 'standard deviation of a refined match [px]; calibrates kappa', 0.05, 10)
     min_matches: int = setting(60, 'fewer refined matches than this: keep the pose mean',
@@ -197,6 +216,8 @@ class KeyframesConfig(Section):
     max_fuse_spread: float = setting(
         0.15, 'a prediction whose log depth ratios to the keyframe scatter more is not fused',
         0.01, 2)
+    fuse: bool = setting(
+        True, "average a keyframe's pointmap and focal length with what later inferences say")
 
 
 @dataclass(frozen=True)
@@ -225,6 +246,7 @@ class Config:
     model: ModelConfig = ModelConfig()
     classical: ClassicalConfig = ClassicalConfig()
     vggt: VggtConfig = VggtConfig()
+    simulated: SimulatedConfig = SimulatedConfig()
     following: FollowingConfig = FollowingConfig()
     tracking: TrackingConfig = TrackingConfig()
     keyframes: KeyframesConfig = KeyframesConfig()

@@ -6,11 +6,12 @@ import time
 from collections import defaultdict
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Callable, Iterator, Sequence as Indices
+from typing import Callable, Iterator, Protocol, Sequence as Indices
 
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
 from aim_slam_ros.config import Config
 from aim_slam_ros.datasets.base import ImageError, Sequence
@@ -19,21 +20,48 @@ from aim_slam_ros.evaluation.run_result import (LoopPair, PlacedKeyframe, RunRes
 from aim_slam_ros.frontend.pipeline import FrontendPipeline
 from aim_slam_ros.loop_closure.pipeline import LoopClosurePipeline
 from aim_slam_ros.models import make_model
-from aim_slam_ros.types import FrameResult
+from aim_slam_ros.models.base import GeometryModel
+from aim_slam_ros.recorded_truth import RecordedTruth
+from aim_slam_ros.types import CorrectedKeyframes, FrameResult, Keyframe
 
 Progress = Callable[[FrameResult | None], None]
 _LAST = ('loop_closure', 'correct')    # stages that follow those of the frontend
 
 
+class Frontend(Protocol):
+    """What a run needs of a FrontendPipeline, or of what is measured in its place."""
+
+    @property
+    def keyframes(self) -> tuple[Keyframe, ...]:
+        """Every keyframe, oldest first."""
+
+    @property
+    def rotation_only_inferences(self) -> int:
+        """How many inferences found a rotation without parallax."""
+
+    def process(self, stamp_ns: int, image: np.ndarray,
+                K: np.ndarray | None = None) -> FrameResult:
+        """One image [H,W,3] uint8 RGB, with its intrinsics where known."""
+
+    def apply_correction(self, corrected: CorrectedKeyframes) -> Tensor:
+        """Take the poses of loop closure, between two images."""
+
+
 def run(sequence: Sequence, config: Config, indices: Indices[int],
-        progress: Progress = lambda result: None) -> RunResult:
+        progress: Progress = lambda result: None,
+        make_frontend: Callable[[Config, GeometryModel], Frontend] = FrontendPipeline
+        ) -> RunResult:
     """Process these images of the sequence, every one of them.
 
     progress: called after each image, with None for an unreadable one. Ctrl-C ends the run: what
-    was gathered until then is returned, marked as interrupted.
+    was gathered until then is returned, marked as interrupted. Raises ConfigError for a model that
+    cannot be made and DatasetError for a simulated one without depth and pose of every image.
     """
+    truth = RecordedTruth(sequence)
+    if config.model.name == 'simulated':
+        truth.require(indices)
     _seed(config.seed)
-    return _Run(sequence, config).over(indices, progress)
+    return _Run(sequence, config, truth, make_frontend).over(indices, progress)
 
 
 def _seed(seed: int) -> None:
@@ -45,10 +73,11 @@ def _seed(seed: int) -> None:
 class _Run:
     """The state of one run."""
 
-    def __init__(self, sequence: Sequence, config: Config) -> None:
-        model = make_model(config)
+    def __init__(self, sequence: Sequence, config: Config, truth: RecordedTruth,
+                 make_frontend: Callable[[Config, GeometryModel], Frontend]) -> None:
+        model = make_model(config, truth)
         self._sequence = sequence
-        self._frontend = FrontendPipeline(config, model)
+        self._frontend = make_frontend(config, model)
         self._loop_closure = LoopClosurePipeline(config, model)
         self._results: list[FrameResult] = []
         self._unreadable: list[UnreadableImage] = []

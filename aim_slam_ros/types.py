@@ -110,6 +110,10 @@ class Keyframe:
         """In its own unit."""
         return float(self.points_cam[::8, ::8, 2].median())
 
+    @cached_property
+    def mean_confidence(self) -> float:
+        return float(self.confidence[::4, ::4].mean())
+
     @property
     def stamp_ns(self) -> int:
         return self.encoding.frame.stamp_ns

@@ -8,7 +8,8 @@ import box_room
 import pytest
 import torch
 
-from aim_slam_ros.frontend.alignment import fused, pose_mean, unit_of
+from aim_slam_ros.config import KeyframesConfig
+from aim_slam_ros.frontend.alignment import fused, observed, pose_mean, unit_of
 from aim_slam_ros.frontend.tracking import TrackingWindow
 from aim_slam_ros.geometry import camera, sim3
 from aim_slam_ros.types import WindowPrediction
@@ -136,3 +137,10 @@ def test_the_focal_length_is_averaged_over_all_observations() -> None:
     uv = camera.project(got.points_cam, got.K)
     grid = camera.pixel_grid(box_room.HEIGHT, box_room.WIDTH)
     assert torch.allclose(uv, grid, atol=1e-2), 'points stay where they were seen'
+
+
+def test_fusion_can_be_switched_off() -> None:
+    T = box_room.trajectory(1)[0]
+    keyframe, prediction = box_room.keyframe(0, T), box_room.prediction([T], UNIT)
+    assert observed(keyframe, prediction, 0, KeyframesConfig()).observations == 2
+    assert observed(keyframe, prediction, 0, KeyframesConfig(fuse=False)) is keyframe

@@ -158,6 +158,27 @@ class TestBundle:
         return bundle.Bundle(poses.numpy(), points.numpy() / z[:, None], 1.0 / z), seen
 
     @staticmethod
+    def _moved(xi: Tensor, P: Tensor, rho: Tensor) -> Tensor:
+        """A point in a camera whose pose is perturbed to first order, at depth 1 / rho."""
+        return P + rho * xi[:3] + torch.linalg.cross(xi[3:], P)
+
+    def test_derivatives_are_those_of_automatic_differentiation(self) -> None:
+        truth, seen = self._problem(1.0)
+        _, J_pose, J_rho = bundle._linearise(truth, seen)
+        for k in (0, 3, len(seen.view) - 1):
+            T = torch.from_numpy(truth.T_view_hub[seen.view[k]])
+            ray = torch.from_numpy(truth.rays[seen.point[k]])
+            rho = torch.tensor(truth.rho[seen.point[k]])
+
+            def projected(xi: Tensor, rho: Tensor) -> Tensor:
+                P = self._moved(xi, T[:3, :3] @ ray + rho * T[:3, 3], rho)
+                return seen.focal_px * P[:2] / P[2]
+
+            by_pose, by_rho = torch.func.jacfwd(projected, (0, 1))(torch.zeros(6).double(), rho)
+            assert np.allclose(J_pose[k], by_pose.numpy(), rtol=1e-9, atol=1e-9)
+            assert np.allclose(J_rho[k], by_rho.numpy(), rtol=1e-9, atol=1e-9)
+
+    @staticmethod
     def _wrong(truth: bundle.Bundle, error: float = 0.03) -> bundle.Bundle:
         rng = np.random.default_rng(1)
         xi = torch.from_numpy(error * rng.standard_normal((2, 7)))

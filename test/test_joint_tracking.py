@@ -51,7 +51,7 @@ def _errors(T: Tensor, truth: Tensor) -> tuple[float, float, float]:
             abs(float(sim3.scale_of(T) / sim3.scale_of(truth)) - 1.0))
 
 
-@pytest.mark.parametrize('residual', ['ray', 'pixel', 'hybrid'])
+@pytest.mark.parametrize('residual', ['ray', 'projection', 'hybrid'])
 @pytest.mark.parametrize('pairs', ['adjacent', 'composed'])
 @pytest.mark.parametrize('views', [2, 3, 5])
 def test_a_consistent_window_stays_where_it_is(views: int, pairs: str, residual: str) -> None:
@@ -67,7 +67,7 @@ def test_a_consistent_window_stays_where_it_is(views: int, pairs: str, residual:
 WRONG = torch.tensor([0.05, -0.03, 0.04, 0.01, -0.012, 0.008, 0.03])   # 1 degree, 7 cm, 3 %
 
 
-@pytest.mark.parametrize('residual', ['ray', 'pixel', 'hybrid'])
+@pytest.mark.parametrize('residual', ['ray', 'projection', 'hybrid'])
 def test_a_wrong_keyframe_is_moved_back_and_the_frame_with_it(residual: str) -> None:
     """Without memory; the guess is the mean over a right and a wrong keyframe."""
     config = replace(CONFIG, memory=0.0, residual=residual)
@@ -184,7 +184,7 @@ def test_kappa_is_one_where_the_noise_is_what_the_sigmas_say() -> None:
     assert joint_solver.solve(start, (loud,), config).kappa == pytest.approx(4.0, abs=0.25)
 
 
-@pytest.mark.parametrize('residual', ['ray', 'pixel', 'hybrid'])
+@pytest.mark.parametrize('residual', ['ray', 'projection', 'hybrid'])
 def test_the_basin_is_wide(residual: str) -> None:
     """From 30 degrees, half the depth and a factor of 2 away."""
     pair, config = _noisy_pair(1e-3, 1e-2), replace(CONFIG, residual=residual)
@@ -199,7 +199,7 @@ def test_points_behind_the_camera_are_no_refuge() -> None:
     pair = _noisy_pair(1e-3, 1e-2)
     turned = box_room.pose((0.0, 0.0, 0.0), (0.0, 3.1, 0.0))[None]
     residuals = PairResiduals((pair,), CONFIG)
-    for kind in ('ray', 'pixel', 'hybrid'):
+    for kind in ('ray', 'projection', 'hybrid'):
         ahead = residuals.linearise(box_room.pose((0, 0, 0), (0, 0.5, 0))[None], kind)
         behind = residuals.linearise(turned, kind)
         assert float(behind.cost) > float(ahead.cost)

@@ -43,7 +43,7 @@ K = camera.intrinsics(500.0, 480.0, 259.0, 196.0)
     (lambda X: X.norm().log(), rays.log_distance_jacobian),
     (lambda X: X[:2] / X[2] * torch.stack([K[0, 0], K[1, 1]]),
      lambda X: rays.pixel_jacobian(X, K)),
-], ids=['point', 'ray', 'log_distance', 'pixel'])
+], ids=['point', 'ray', 'log_distance', 'projection'])
 def test_jacobians_agree_with_autodiff(function: Callable[[Tensor], Tensor],
                                        jacobian: Callable[[Tensor], Tensor]) -> None:
     points = _points()

@@ -8,12 +8,13 @@ from typing import Sequence
 import box_room
 import pytest
 import torch
+from torch import Tensor
 
 from aim_slam_ros.config import SigmaConfig
 from aim_slam_ros.frontend import sigma
 from aim_slam_ros.frontend.voxel_index import (VoxelIndex, confident_points,
                                                relative_voxel_size)
-from aim_slam_ros.geometry import rays, sim3
+from aim_slam_ros.geometry import camera, rays, sim3
 from aim_slam_ros.types import Keyframe
 
 CONFIG = SigmaConfig()
@@ -45,16 +46,44 @@ def test_gain_is_that_of_the_kalman_update() -> None:
     last, other = _last(), _seen_at(1, 0.3, unit=0.6)
     config = replace(CONFIG, points=40, depth_tolerance=1.0)
     prior = sigma._uncertain_points(last, config)
-    view = sigma._seen_from(other, last, prior, config)
-    P, J, R = prior.covariance, view.J, view.R
+    view = sigma._seen_from([other], last, prior, config)
+    T = sim3.inverse(other.T_world_kf) @ last.T_world_kf
+    J = torch.stack([torch.func.jacfwd(lambda x: rays.rays_of(T[:3, :3] @ x + T[:3, 3]))(x)
+                     for x in prior.points.T])
+    P, R, predicted = (M.movedim(-1, 0) for M in (prior.covariance, view.R[0], view.predicted[0]))
+    torch.testing.assert_close(predicted, J @ P @ J.mT, rtol=1e-9, atol=1e-15)
     posterior = P - P @ J.mT @ torch.linalg.inv(R + J @ P @ J.mT) @ J @ P
     gain = 0.5 * torch.log(torch.linalg.det(P) / torch.linalg.det(posterior))
     got = sigma.rerank(last, [other], config)
-    assert got[0].gain == pytest.approx(float(gain[view.visible].sum()), rel=1e-6)
-    T = sim3.inverse(other.T_world_kf) @ last.T_world_kf
-    by_autodiff = torch.func.jacfwd(lambda x: rays.rays_of(T[:3, :3] @ x + T[:3, 3]))(
-        prior.points[0])
-    torch.testing.assert_close(J[0], by_autodiff, rtol=1e-9, atol=1e-9)
+    assert got[0].gain == pytest.approx(float(gain[view.visible[0]].sum()), rel=1e-6)
+
+
+def test_a_covariance_is_that_of_the_inverse_projection() -> None:
+    """z K^-1 (u, v, 1), its Jacobian by automatic differentiation."""
+    points = torch.tensor([[0.3, -0.4, 2.0], [-1.0, 0.2, 3.5]], dtype=torch.float64)
+    confidence, K = torch.tensor([3.0, 9.0], dtype=torch.float64), box_room.K
+
+    def unprojected(measured: Tensor) -> Tensor:
+        ray = torch.cat([(measured[:2] - K[:2, 2]) / K.diagonal()[:2], torch.ones(1).double()])
+        return measured[2] * ray
+
+    got = sigma._covariance(points.T, confidence, 4.0, K.diagonal()[:2], CONFIG)
+    for x, c, covariance in zip(points, confidence, got.unbind(-1)):
+        uv = camera.project(x, K)
+        J = torch.func.jacfwd(unprojected)(torch.cat([uv, x[2:]]))
+        pixel = torch.tensor(CONFIG.sigma_px ** 2)
+        noise = torch.stack([pixel, pixel,
+                             (CONFIG.sigma_depth * x[2]) ** 2 * 4.0 / (c - 1.0)])
+        torch.testing.assert_close(covariance, (J * noise) @ J.T, rtol=1e-9, atol=1e-15)
+
+
+def test_a_covariance_reaches_the_rays_by_their_derivative() -> None:
+    X = torch.tensor([[0.3, -0.4, 2.0], [-1.0, 0.2, 3.5]], dtype=torch.float64)
+    half = torch.randn(2, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    M = half @ half.mT
+    D = torch.stack([torch.func.jacfwd(rays.rays_of)(x) for x in X])
+    got = sigma._on_rays(M.movedim(0, -1), X.T).movedim(-1, 0)
+    torch.testing.assert_close(got, D @ M @ D.mT, rtol=1e-9, atol=1e-12)
 
 
 def test_parallax_informs_more_than_a_copy_of_the_view() -> None:
@@ -148,3 +177,11 @@ def test_a_map_with_one_keyframe_has_no_candidate() -> None:
     got = _activate([7.0], [])
     assert got.window == (9,) and got.tried == ((9,),)
     assert _activate([7.0], [5, 4], replace(CONFIG, max_window=2)).window == (9,)
+
+
+def test_a_window_may_start_wider() -> None:
+    wider = replace(CONFIG, min_window=5, max_window=6)
+    assert _activate([0.5], [6, 5, 4, 3, 2], wider).tried == ((9, 6, 5, 4),)
+    got = _activate([3.0, 4.0], [6, 5, 4, 3, 2], wider)
+    assert got.window == (9, 6, 5, 4) and len(got.tried) == 2, 'back to where it started'
+    assert _activate([3.0], [6, 5, 4], replace(CONFIG, min_window=9)).window == (9, 6, 5, 4)

@@ -43,11 +43,14 @@ def test_speed(benchmark: ModuleType, tmp_path: Path,
 
 
 def test_the_full_size_spares_a_quarter_of_its_operations(benchmark: ModuleType) -> None:
-    """Counted, not computed. 7.94 TFLOP is what the official code needs for three views."""
+    """Counted, not computed. The official code needs 7.94 TFLOP for three views; ours has the last
+    layer of each fusion before it resizes: 66038 pixels fewer a view, 2 x 256 x 256 each.
+    """
     case = benchmark.SIZES['full']
     without, cached = (benchmark._flops(case, 3, path) / 1e12
                        for path in (benchmark._without_cache, benchmark._with_cache))
-    assert without == pytest.approx(7.94, abs=0.01)
+    spared = 3 * 66038 * 2 * 256 ** 2 / 1e12
+    assert without == pytest.approx(7.943 - spared, abs=0.002)
     assert without / cached == pytest.approx(1.35, abs=0.01)
 
 

@@ -7,9 +7,11 @@ import sys
 from pathlib import Path
 from typing import Any, Sequence
 
-from aim_slam_ros.cli.arguments import (Refusal, assignment, configured, selection, settings_text,
-                                        whole_number, writable_folder)
+from aim_slam_ros.cli.arguments import (Refusal, assignment, configured, settings_text,
+                                        writable_folder)
+from aim_slam_ros.cli.image_choice import add_image_options, chosen, opened
 from aim_slam_ros.config import Config
+from aim_slam_ros.settings import ConfigError
 
 # torch and matplotlib take seconds to import: what needs them is imported in _evaluate, after the
 # command line has been found good.
@@ -45,18 +47,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--out', metavar='DIR', type=Path, required=True,
                         help='where the results go; files of an earlier run are replaced')
     parser.add_argument('--model', metavar='M', help='the geometry model (model.name)')
-    parser.add_argument('--stride', metavar='K', type=whole_number(1), default=1,
-                        help='take every K-th image (default 1)')
-    parser.add_argument('--start', metavar='S', type=whole_number(0), default=0,
-                        help='the first image, counted from 0')
-    parser.add_argument('--count', metavar='N', type=whole_number(1),
-                        help='look at the N images from the first one on, before --stride')
+    add_image_options(parser)
     parser.add_argument('--set', metavar='section.name=value', type=assignment, action='append',
                         default=[], dest='settings', help='change a setting; may be repeated')
     parser.add_argument('--no-loop-closure', action='store_true')
     parser.add_argument('--seed', metavar='N', help='seed of every random choice')
-    parser.add_argument('--undistort', action='store_true',
-                        help='remove lens distortion from the images; needs a calibration')
     parser.add_argument('--list-settings', action=_ListSettings, nargs=0,
                         help='show every setting with its default and range, and exit')
     return parser
@@ -78,18 +73,18 @@ def _assignments(args: argparse.Namespace) -> list[tuple[str, str]]:
 
 
 def _evaluate(args: argparse.Namespace, config: Config) -> int:
-    from aim_slam_ros.datasets import DatasetError, load_sequence
-    try:
-        sequence = load_sequence(args.dataset, undistort=args.undistort)
-    except DatasetError as error:
-        raise Refusal(str(error)) from error
-    indices = selection(len(sequence), args.start, args.count, args.stride)
+    sequence = opened(args.dataset, args)
+    indices = chosen(sequence, args)
 
     from aim_slam_ros import offline
     from aim_slam_ros.cli.progress import progress_bar
     from aim_slam_ros.cli.results import write_results
+    from aim_slam_ros.datasets import DatasetError
     with progress_bar(len(indices)) as progress:
-        run = offline.run(sequence, config, indices, progress)
+        try:
+            run = offline.run(sequence, config, indices, progress)
+        except (ConfigError, DatasetError) as error:
+            raise Refusal(str(error)) from error
     write_results(args.out, sequence, config, run)
     return _INTERRUPTED if run.interrupted else 0
 

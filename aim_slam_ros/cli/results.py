@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Mapping
 
+from aim_slam_ros.assessment import assess
 from aim_slam_ros.config import Config
 from aim_slam_ros.datasets.base import Sequence
 from aim_slam_ros.datasets.text import write_tum_trajectory
@@ -12,7 +14,7 @@ from aim_slam_ros.evaluation.metrics import Metric
 from aim_slam_ros.evaluation.reconstruction import write_ply
 from aim_slam_ros.evaluation.report import ReportData, write_report
 from aim_slam_ros.evaluation.run_result import Run
-from aim_slam_ros.evaluation.trajectory import Incomparable, TrajectoryError, compare
+from aim_slam_ros.evaluation.trajectory import Incomparable, TrajectoryError
 
 _Rows = tuple[tuple[str, str, str], ...]    # metric, its name for a person, format
 _TRAJECTORY: _Rows = (
@@ -20,6 +22,9 @@ _TRAJECTORY: _Rows = (
     ('ate_rmse_causal_m', 'ATE RMSE, as reported [m]', '{:.4f}'),
     ('frames_offered', 'images offered', '{}'),
     ('tracked_percent', 'tracked [%]', '{:.1f}'),
+)
+_SURFACE: _Rows = (
+    ('surface', 'map: accuracy / completion / chamfer [m]', '{}'),
 )
 _DELIVERY: _Rows = (
     ('dropped', 'dropped', '{}'),
@@ -45,19 +50,15 @@ _SEED: _Rows = (('seed', 'seed', '{}'),)
 
 def write_results(folder: Path, sequence: Sequence, config: Config, run: Run) -> None:
     """Write every file and print the table, the report's path last."""
-    truth = sequence.groundtruth
-    error = compare(run.trajectory, truth) if truth else \
-        Incomparable('there is no ground truth')
-    figures = metrics.compute(run, truth, error) | {
-        'seed': config.seed, 'model': config.model.name, 'dataset': sequence.name}
-    table = _table(figures, run)
+    assessment = assess(run, sequence, config)
+    table = _table(assessment.figures, run)
     write_tum_trajectory(folder / 'trajectory.txt', run.trajectory)
     write_tum_trajectory(folder / 'keyframes.txt', run.keyframe_trajectory)
     write_ply(folder / 'map.ply', run.map_cloud)
     (folder / 'config.yaml').write_text(config.to_yaml(), encoding='utf-8')
-    metrics.write(folder / 'metrics.json', figures)
-    write_report(folder / 'report.png', _report(sequence, config, run, error, table))
-    _print(run, error, table)
+    metrics.write(folder / 'metrics.json', assessment.figures)
+    write_report(folder / 'report.png', _report(sequence, config, run, assessment.error, table))
+    _print(run, assessment.error, table)
     print(folder / 'report.png')
 
 
@@ -74,15 +75,22 @@ def _report(sequence: Sequence, config: Config, run: Run,
         table=table)
 
 
-def _table(figures: dict[str, Metric], run: Run) -> tuple[tuple[str, str], ...]:
-    rows = _TRAJECTORY + _DELIVERY + _MAP + _SEED if run.delivery else \
-        _TRAJECTORY + _MAP + _WITHOUT_MODEL + _SEED
-    shown = figures | _joined(figures) if run.delivery else figures
+def _table(figures: Mapping[str, Metric], run: Run) -> tuple[tuple[str, str], ...]:
+    rows = _TRAJECTORY + _SURFACE + _DELIVERY + _MAP + _SEED if run.delivery else \
+        _TRAJECTORY + _SURFACE + _MAP + _WITHOUT_MODEL + _SEED
+    shown = {**figures, 'surface': _surface(figures),
+             **(_delivered(figures) if run.delivery else {})}
     return tuple((label, '–' if shown[name] is None else form.format(shown[name]))
                  for name, label, form in rows)
 
 
-def _joined(figures: dict[str, Metric]) -> dict[str, Metric]:
+def _surface(figures: Mapping[str, Metric]) -> str | None:
+    names = ('accuracy', 'completion', 'chamfer')
+    values = [figures[f'reconstruction_{name}_m'] for name in names]
+    return None if None in values else ' / '.join(f'{value:.4f}' for value in values)
+
+
+def _delivered(figures: Mapping[str, Metric]) -> dict[str, Metric]:
     """Figures that share a line of the table."""
     latencies = [figures[f'latency_ms_{name}'] for name in ('p50', 'p95', 'p99')]
     share = figures['dropped_percent']

@@ -8,25 +8,30 @@ from pathlib import Path
 from typing import Mapping, Sequence
 
 from aim_slam_ros.evaluation.delivery import Delivery
+from aim_slam_ros.evaluation.metric import Metric, finite
+from aim_slam_ros.evaluation.reconstruction import ReconstructionError
 from aim_slam_ros.evaluation.run_result import Run
 from aim_slam_ros.evaluation.trajectory import (Incomparable, TrajectoryError, compare, during,
                                                 length)
 from aim_slam_ros.types import StampedPoses, TrackingStatus
 
-Metric = float | int | str | bool | None
 _MODEL_STAGES = ('encode', 'infer')
 
 
 def compute(run: Run, groundtruth: StampedPoses | None,
-            final: TrajectoryError | Incomparable) -> dict[str, Metric]:
+            final: TrajectoryError | Incomparable,
+            surface: ReconstructionError | None = None) -> dict[str, Metric]:
     """Every figure that follows from a run; None where it is not available.
 
-    final: the error of ``run.trajectory``.
+    final: the error of ``run.trajectory``; surface: of its map.
     """
     causal = _rmse(compare(run.causal_trajectory, groundtruth)) if groundtruth else None
     return {
         'ate_rmse_m': _rmse(final),
         'ate_rmse_causal_m': causal,
+        'reconstruction_accuracy_m': surface.accuracy_m if surface else None,
+        'reconstruction_completion_m': surface.completion_m if surface else None,
+        'reconstruction_chamfer_m': surface.chamfer_m if surface else None,
         **_counts(run),
         **_rates(run),
         **(_delivered(run, run.delivery) if run.delivery else {}),
@@ -43,10 +48,9 @@ def processed(run: Run) -> int:
 
 
 def write(path: Path, metrics: Mapping[str, Metric]) -> None:
-    """JSON; a figure that is not finite becomes null, since JSON knows no NaN."""
-    clean = {name: None if isinstance(value, float) and not math.isfinite(value) else value
-             for name, value in metrics.items()}
-    path.write_text(json.dumps(clean, indent=2, allow_nan=False) + '\n', encoding='utf-8')
+    """JSON; a figure that is not finite becomes null."""
+    text = json.dumps(finite(metrics), indent=2, allow_nan=False)
+    path.write_text(text + '\n', encoding='utf-8')
 
 
 def _counts(run: Run) -> dict[str, Metric]:

@@ -47,8 +47,8 @@ def pose_mean(window: TrackingWindow, min_seen: float) -> Tensor | None:
 
 def observed(keyframe: Keyframe, prediction: WindowPrediction, view: int,
              config: KeyframesConfig) -> Keyframe:
-    """The keyframe with the prediction fused in, or as it was where they do not fit together."""
-    if prediction.seen_share(view) < config.min_confident:
+    """The keyframe with the prediction fused in, where that is wanted and the two fit together."""
+    if not config.fuse or prediction.seen_share(view) < config.min_confident:
         return keyframe
     unit = unit_of(keyframe, prediction, view)
     if not unit.count or unit.spread > config.max_fuse_spread:

@@ -32,17 +32,18 @@ class ImageTracker:
 
     def track(self, window: TrackingWindow) -> TrackingResult:
         """Keyframes stay where they are. Fails where neither model nor images place the frame."""
-        start = pose_mean(window, self._min_seen)
-        guess = start if window.T_world_frame_guess is None else window.T_world_frame_guess
+        guess = window.T_world_frame_guess
+        if guess is None:
+            guess = pose_mean(window, self._min_seen)
         if guess is None:
             return _failed('the model connected the image with no keyframe of its window')
         rigid_start = sim3.rigid_part(guess)
         matches, solution = self._refined(window, rigid_start)
         if solution is None or self._strays(rigid_start, solution, matches):
-            return self._fallback(start, guess, matches)
+            return self._fallback(window, matches)
         scale = self._scale(window, matches, solution.T_cam_ref, solution.inliers)
         if not scale:
-            return self._fallback(start, guess, matches)
+            return self._fallback(window, matches)
         return TrackingResult(
             True, sim3.with_scale(sim3.inverse(solution.T_cam_ref), scale), solution.kappa,
             matches.best_fraction(solution.inliers),
@@ -96,9 +97,9 @@ class ImageTracker:
                     @ sim3.with_scale(sim3.inverse(alone.T_cam_ref), scale)
         return measured
 
-    def _fallback(self, start: Tensor | None, guess: Tensor | None,
-                  matches: PredictedMatches) -> TrackingResult:
+    def _fallback(self, window: TrackingWindow, matches: PredictedMatches) -> TrackingResult:
         """Where the images add nothing: the pose it was followed to, else the model's own."""
+        start, guess = pose_mean(window, self._min_seen), window.T_world_frame_guess
         if start is None:
             return _failed(f'only {len(matches.uv)} matches were found in the images and the '
                            'model did not connect the window')

@@ -42,10 +42,12 @@ class PairMatches:
 class PairTerms:
     """P pairs, linearised: equations [P,7,7], [P,7]; cost [P] with Huber.
 
-    chi2: [P] without Huber, over ``rows`` [P] independent data.
+    information: [P,7,7] of the independent data alone. chi2: [P] of them, without Huber, over
+    ``rows`` [P]. Rays and projections are the same data twice: of hybrid only the rays count.
     """
 
     equations: NormalEquations
+    information: Tensor
     cost: Tensor
     chi2: Tensor
     rows: Tensor
@@ -61,7 +63,7 @@ class _Whitened:
 
 
 class PairResiduals:
-    """Rays or pixels or both, and always log-distances, of a batch of pairs."""
+    """Rays or projections or both, and always log-distances, of a batch of pairs."""
 
     def __init__(self, pairs: tuple[PairMatches, ...], config: JointTrackingConfig) -> None:
         self._config = config
@@ -84,7 +86,7 @@ class PairResiduals:
         return thin
 
     def linearise(self, T_i_j: Tensor, kind: str) -> PairTerms:
-        """The terms at T_i_j [P,4,4]; kind: 'ray', 'pixel' or 'hybrid'."""
+        """The terms at T_i_j [P,4,4]; kind: 'ray', 'projection' or 'hybrid'."""
         config, T = self._config, T_i_j.to(self._points_j)
         X = T[:, :3, :3] @ self._points_j + T[:, :3, 3:]
         d2 = X.square().sum(1)
@@ -97,10 +99,11 @@ class PairResiduals:
         e_ray = self._rays_i - X * d2.rsqrt()[:, None]
         by_log = self._whitened(e_log.square(), q, config.sigma_log_distance)
         by_ray = self._whitened(e_ray.square().sum(1), q, config.sigma_ray)
-        ray_weight = torch.zeros_like(q) if kind == 'pixel' else by_ray.weight
+        ray_weight = torch.zeros_like(q) if kind == 'projection' else by_ray.weight
         equations = rays.ray_normal_equations(X, e_ray, e_log, ray_weight, by_log.weight)
+        information = equations.H
         cost, chi2 = by_log.cost, by_log.chi2
-        if kind != 'pixel':
+        if kind != 'projection':
             cost = cost + by_ray.cost
         if kind != 'ray':
             e_px = self._uv_i - self._projected(X)
@@ -108,11 +111,12 @@ class PairResiduals:
             equations = equations + rays.pixel_normal_equations(
                 X, e_px, by_px.weight, self._focal)
             cost = cost + by_px.cost
-        # Rays and pixels are the same data twice: only one of them counts.
-        chi2 = chi2 + (by_px.chi2 if kind == 'pixel' else by_ray.chi2)
+        if kind == 'projection':
+            information = equations.H
+        chi2 = chi2 + (by_px.chi2 if kind == 'projection' else by_ray.chi2)
         used = self._q > 0
         behind = (used & ~front).sum(-1)
-        return PairTerms(equations, cost + behind * self._cost_behind(kind), chi2,
+        return PairTerms(equations, information, cost + behind * self._cost_behind(kind), chi2,
                          3 * (used & front).sum(-1))
 
     def _whitened(self, squared: Tensor, q: Tensor, sigma: float) -> _Whitened:
@@ -133,7 +137,7 @@ class PairResiduals:
     def _cost_behind(self, kind: str) -> float:
         """More than a point in front of the camera pays for its direction."""
         k, cost = self._config.huber, 0.0
-        if kind != 'pixel':
+        if kind != 'projection':
             cost += k * 2.0 / self._config.sigma_ray
         if kind != 'ray':
             cost += k * self._diagonal_px / self._config.sigma_pixel

@@ -16,7 +16,7 @@ from torch import Tensor
 from ..config import JointTrackingConfig
 from ..geometry import sim3
 from ..geometry.rays import NormalEquations
-from .joint_residuals import PairMatches, PairResiduals
+from .joint_residuals import PairMatches, PairResiduals, PairTerms
 
 # Every eighth match is enough while rays alone bring the state near: they have the widest basin.
 COARSE_STEP = 8
@@ -24,11 +24,17 @@ COARSE_STEP = 8
 
 @dataclass(frozen=True)
 class JointSolution:
-    """links: [n-1,4,4] float64. kappa: reduced chi-square. iterations: steps tried."""
+    """links: [n-1,4,4] float64. kappa: reduced chi-square. iterations: steps tried.
+
+    information: [7(n-1),7(n-1)] float64 of the links under left perturbations, what is remembered
+    included; its inverse is their covariance as far as the sigmas are honest. It has Huber's
+    weights, so that it is some 4 % too modest under Gaussian noise.
+    """
 
     links: Tensor
     kappa: float
     iterations: int
+    information: Tensor
 
 
 @dataclass(frozen=True)
@@ -41,11 +47,24 @@ class _Memory:
 
 @dataclass(frozen=True)
 class _System:
-    """The whole window, linearised: equations over 7 (n-1) unknowns, the cost and kappa."""
+    """The whole window, linearised: equations over 7 (n-1) unknowns, and the cost.
+
+    carries: [7,7(j-i)] of each pair, from its links' perturbations to its own. terms: the pairs.
+    """
 
     equations: NormalEquations
     cost: float
-    kappa: float
+    carries: tuple[Tensor, ...]
+    terms: PairTerms
+
+
+@dataclass(frozen=True)
+class _Descended:
+    """links: [n-1,4,4]. tried: steps. system: where it was linearised last."""
+
+    links: Tensor
+    tried: int
+    system: _System
 
 
 def solve(links: Tensor, pairs: tuple[PairMatches, ...],
@@ -55,9 +74,12 @@ def solve(links: Tensor, pairs: tuple[PairMatches, ...],
     coarse = full.thinned(COARSE_STEP)
     memory = _memory(pairs, coarse, config.residual)
     less = _Memory(memory.T_i_j, memory.information / COARSE_STEP)
-    links, tried, _ = _Descent(pairs, coarse, less, 'ray', config).run(links)
-    links, more, kappa = _Descent(pairs, full, memory, config.residual, config).run(links)
-    return JointSolution(links, kappa, tried + more)
+    near = _Descent(pairs, coarse, less, 'ray', config).run(links)
+    end = _Descent(pairs, full, memory, config.residual, config).run(near.links)
+    data = _assembled(pairs, end.system.carries, end.system.terms.information.cpu())
+    remembered = _assembled(pairs, end.system.carries, memory.information)
+    return JointSolution(end.links, _kappa(end.system.terms, data), near.tried + end.tried,
+                         data + remembered)
 
 
 def _memory(pairs: tuple[PairMatches, ...], coarse: PairResiduals, kind: str) -> _Memory:
@@ -82,8 +104,8 @@ class _Descent:
         self._pairs, self._residuals, self._memory = pairs, residuals, memory
         self._kind, self._config = kind, config
 
-    def run(self, links: Tensor) -> tuple[Tensor, int, float]:
-        """The optimised links, the steps tried and kappa there."""
+    def run(self, links: Tensor) -> _Descended:
+        """Until a step would gain next to nothing."""
         system, damping = self._system(links), 1e-6
         tried, limit = 0, self._config.relative_decrease
         while tried < self._config.max_iterations and damping < 1e6:
@@ -94,13 +116,13 @@ class _Descent:
             trial = sim3.exp(step.reshape(-1, 7)) @ links
             # A step that promises next to nothing is the last one: no need to look where it ends.
             if 0.5 * float(step @ system.equations.g) < limit * system.cost:
-                return trial, tried, system.kappa
+                return _Descended(trial, tried, system)
             new = self._system(trial)
             if new.cost < system.cost:
                 links, system, damping = trial, new, max(damping * 0.1, 1e-9)
             else:
                 damping *= 100.0
-        return links, tried, system.kappa
+        return _Descended(links, tried, system)
 
     def _system(self, links: Tensor) -> _System:
         """Perturbed links move a pair by delta_ij = sum over k of Ad(T_i_k) delta_k."""
@@ -112,17 +134,33 @@ class _Descent:
         pull = (self._memory.information @ away[..., None])[..., 0]
         pair_H = terms.equations.H.cpu() + self._memory.information
         pair_g = terms.equations.g.cpu() + pull
-        H = torch.zeros(7 * len(links), 7 * len(links), dtype=torch.float64)
+        carries = tuple(sim3.adjoint(torch.stack(chain[:-1])).transpose(0, 1).reshape(7, -1)
+                        for chain in chains)
         g = torch.zeros(7 * len(links), dtype=torch.float64)
-        for pair, chain, H_ij, g_ij in zip(self._pairs, chains, pair_H, pair_g):
-            carry = sim3.adjoint(torch.stack(chain[:-1])).transpose(0, 1).reshape(7, -1)
-            span = slice(7 * pair.i, 7 * pair.j)
-            H[span, span] += carry.T @ H_ij @ carry
-            g[span] += carry.T @ g_ij
-        freedom = int(terms.rows.sum()) - len(g)
-        kappa = float(terms.chi2.sum()) / freedom if freedom > 0 else math.inf
+        for pair, carry, g_ij in zip(self._pairs, carries, pair_g):
+            g[7 * pair.i:7 * pair.j] += carry.T @ g_ij
         cost = float(terms.cost.sum()) + 0.5 * float((away * pull).sum())
-        return _System(NormalEquations(H, g), cost, kappa)
+        return _System(NormalEquations(_assembled(self._pairs, carries, pair_H), g), cost,
+                       carries, terms)
+
+
+def _assembled(pairs: tuple[PairMatches, ...], carries: tuple[Tensor, ...],
+               pair_H: Tensor) -> Tensor:
+    """The pairs' matrices [P,7,7], each on the links that it spans: [7(n-1),7(n-1)]."""
+    size = 7 * max(pair.j for pair in pairs)
+    H = torch.zeros(size, size, dtype=torch.float64)
+    for pair, carry, H_ij in zip(pairs, carries, pair_H):
+        span = slice(7 * pair.i, 7 * pair.j)
+        H[span, span] += carry.T @ H_ij @ carry
+    return H
+
+
+def _kappa(terms: PairTerms, information: Tensor) -> float:
+    """Chi-square over M - rank(A): a link that no match sees is no unknown."""
+    scale = information.diagonal().clamp_min(1e-300).rsqrt()
+    values = torch.linalg.eigvalsh(scale[:, None] * information * scale)
+    freedom = int(terms.rows.sum()) - int((values > 1e-9 * values[-1].clamp_min(1e-300)).sum())
+    return float(terms.chi2.sum()) / freedom if freedom > 0 else math.inf
 
 
 def _step(equations: NormalEquations, damping: float) -> Tensor | None:

@@ -107,11 +107,11 @@ class JointTracker:
                      self._offered(prediction.confidence[0]), None)
 
     def _offered(self, confidence: Tensor) -> int:
-        return max(1, len(grid_indices(confidence, self._config.stride)))
+        return max(1, len(_grid_indices(confidence, self._config.stride)))
 
     def _grid(self, confidence: Tensor, points: Tensor) -> Tensor:
         """Flat indices [M] of the grid points that were seen, in front and confident enough."""
-        at = grid_indices(confidence, self._config.stride)
+        at = _grid_indices(confidence, self._config.stride)
         at = at[torch.isfinite(confidence.reshape(-1)[at])
                 & (confidence.reshape(-1)[at] > GUESSED_CONFIDENCE)
                 & (points.reshape(-1, 3)[at, 2] > 0)]
@@ -153,12 +153,8 @@ class JointTracker:
         return self._config.memory * min(view_i.observations, view_j.observations)
 
 
-def grid_indices(image: Tensor, stride: int) -> Tensor:
-    """[M] int64: flat indices of every ``stride``-th pixel, both ways, of an image [H,W]."""
-    height, width = image.shape
-    rows = torch.arange(stride // 2, height, stride, device=image.device)
-    columns = torch.arange(stride // 2, width, stride, device=image.device)
-    return (rows[:, None] * width + columns).reshape(-1)
+def _grid_indices(image: Tensor, stride: int) -> Tensor:
+    return camera.grid_indices(*image.shape, stride, str(image.device))
 
 
 def _median_depth(view: _View) -> float:

@@ -51,8 +51,9 @@ class KeyframeMap:
     def add(self, encoding: FrameEncoding, K: Tensor, points_cam: Tensor, confidence: Tensor,
             T_world_kf: Tensor) -> Keyframe:
         """A new keyframe; the points in its own unit, the scale in its pose."""
-        keyframe = Keyframe(len(self._keyframes), self.piece_id, encoding, K, points_cam,
-                            confidence, T_world_kf)
+        # A view would keep the whole inference in memory.
+        keyframe = Keyframe(len(self._keyframes), self.piece_id, encoding, K.clone(),
+                            points_cam.contiguous(), confidence.clone(), T_world_kf)
         self._keyframes[keyframe.keyframe_id] = keyframe
         self._piece_ids.append(keyframe.keyframe_id)
         self._descriptors.append(encoding.descriptor)

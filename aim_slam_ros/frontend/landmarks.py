@@ -47,8 +47,8 @@ class Landmarks:
     def relative_sigma(self, keyframe: Keyframe, sigma_at_mean: float) -> np.ndarray:
         """[N] relative standard deviation of their depths."""
         u, v = self._pixels()
-        mean = float(keyframe.confidence[::4, ::4].mean())
-        return relative_depth_sigma(keyframe.confidence[v, u], mean, sigma_at_mean).numpy()
+        return relative_depth_sigma(keyframe.confidence[v, u], keyframe.mean_confidence,
+                                    sigma_at_mean).numpy()
 
     def _pixels(self) -> tuple[np.ndarray, np.ndarray]:
         whole = np.rint(self.uv).astype(np.int64)

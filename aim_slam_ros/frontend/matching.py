@@ -50,15 +50,14 @@ def predict_matches(keyframes: Sequence[Keyframe], grey: np.ndarray, K: Tensor,
 def _of_one(keyframe: Keyframe, grey: np.ndarray, K: Tensor, T_world_cam: Tensor, stride: int,
             sigma_depth: float) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Grid points offered, and per match: point, spread (world), pixel, weight."""
-    half = stride // 2
-    grid = camera.pixel_grid(keyframe.frame.height, keyframe.frame.width)
-    grid = grid[half::stride, half::stride]
-    confidence = keyframe.confidence[half::stride, half::stride]
+    width = keyframe.frame.width
+    at = camera.grid_indices(keyframe.frame.height, width, stride)
+    confidence = keyframe.confidence.reshape(-1).index_select(0, at)
     seen = confidence >= torch.quantile(confidence, 0.2).clamp_min(GUESSED_CONFIDENCE)
-    points = keyframe.points_cam[half::stride, half::stride][seen].double()
-    uv_kf = grid[seen].numpy()
-    mean = float(keyframe.confidence[::4, ::4].mean())
-    sigma = relative_depth_sigma(confidence[seen], mean, sigma_depth).double()
+    at, confidence = at[seen], confidence[seen]
+    points = keyframe.points_cam.reshape(-1, 3).index_select(0, at).double()
+    uv_kf = torch.stack([at % width, at // width], -1).float().numpy()
+    sigma = relative_depth_sigma(confidence, keyframe.mean_confidence, sigma_depth).double()
     world = sim3.transform(keyframe.T_world_kf, points)
     uv = camera.project(sim3.transform(sim3.inverse(T_world_cam), world), K).numpy()
     found = refine(keyframe.frame.grey, grey, uv_kf, uv, levels=TIGHT_LEVELS)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..config import SigmaConfig
-from ..geometry import camera, rays, sim3
+from ..geometry import camera, sim3
 from ..types import GUESSED_CONFIDENCE, Keyframe
 from .voxel_index import VoxelIndex
 
@@ -70,11 +70,9 @@ def rerank(last: Keyframe, candidates: Sequence[Keyframe], config: SigmaConfig,
     if not others:
         return []
     prior = _uncertain_points(last, config)
-    seen = [_seen_from(kf, last, prior, config) for kf in others]
-    J = torch.stack([view.J for view in seen])   # [C,N,3,3]
-    R = torch.stack([view.R for view in seen])
-    per_point = 0.5 * torch.log(_det(R + J @ prior.covariance @ J.mT) / _det(R))
-    visible = torch.stack([view.visible for view in seen]) & torch.isfinite(per_point)
+    seen = _seen_from(others, last, prior, config)
+    per_point = 0.5 * torch.log(_det(seen.R + seen.predicted) / _det(seen.R))
+    visible = seen.visible & torch.isfinite(per_point)
     gains = torch.where(visible, per_point, torch.zeros_like(per_point)).sum(-1)
     ranked = [Ranked(kf.keyframe_id, float(gain)) for kf, gain in zip(others, gains)]
     return sorted(ranked, key=lambda r: (-r.gain, -r.keyframe_id))
@@ -84,7 +82,8 @@ def activate(last_id: int, candidates: Sequence[int],
              attempt: Callable[[tuple[int, ...]], A],
              reorder: Callable[[A, tuple[int, ...]], Sequence[int]],
              config: SigmaConfig) -> Activation[A]:
-    """Stage 3: start from the last keyframe and the best candidate, add while kappa asks for it.
+    """Stage 3: start from config.min_window views, that is from the current frame, the last
+    keyframe and the best candidate, and add while kappa asks for it.
 
     candidates: ids, best first; empty where there is only one keyframe. attempt: infers and
     tracks with the window's keyframe ids. reorder: the remaining ids, best first, after an
@@ -92,8 +91,8 @@ def activate(last_id: int, candidates: Sequence[int],
     lowers it; the first addition that does not, takes it back to where it started.
     """
     remaining = tuple(k for k in candidates if k != last_id)
-    window = (last_id, *remaining[:1]) if config.max_window > 2 else (last_id,)
-    remaining = remaining[1:]
+    beside = min(config.min_window, config.max_window) - 2
+    window, remaining = (last_id, *remaining[:beside]), remaining[beside:]
     first = best = Activation(attempt(window), window, (window,))
     while (remaining and len(best.window) + 1 < config.max_window
            and _kappa(best.attempt) > config.kappa):
@@ -114,9 +113,12 @@ def _kappa(attempt: Attempt) -> float:
     return attempt.kappa if attempt.ok else float('inf')
 
 
+# Points and matrices have their components first and N last, [3,N] and [3,3,N]: sums over three
+# neighbours in memory cost ten times more.
+
 @dataclass(frozen=True)
 class _Uncertain:
-    """points: [N,3] float64 in the last keyframe, with their covariance [N,3,3].
+    """points: [3,N] float64 in the last keyframe, with their covariance [3,3,N].
 
     typical: the confidence that one observation brings.
     """
@@ -128,63 +130,96 @@ class _Uncertain:
 
 @dataclass(frozen=True)
 class _Seen:
-    """How a candidate sees N points. J: [N,3,3] ray by point; R: [N,3,3]; visible: [N] bool."""
+    """How C candidates see N points. visible: [C,N].
 
-    J: Tensor
+    predicted: [C,3,3,N], the points' covariance in the candidates' rays, J P J^T, with J the
+    Jacobian of the ray by the point. R: [C,3,3,N], that of the measured rays.
+    """
+
+    predicted: Tensor
     R: Tensor
     visible: Tensor
 
 
 def _uncertain_points(last: Keyframe, config: SigmaConfig) -> _Uncertain:
     """The least confident of the points that the last keyframe has seen, on the grid."""
-    points = last.points_cam[::config.stride, ::config.stride].reshape(-1, 3).double()
-    confidence = last.confidence[::config.stride, ::config.stride].reshape(-1).double()
+    points = last.points_cam[::config.stride, ::config.stride].reshape(-1, 3)
+    confidence = last.confidence[::config.stride, ::config.stride].reshape(-1)
     usable = (points[:, 2] > 0) & torch.isfinite(points).all(-1)
     usable &= torch.isfinite(confidence) & (confidence > GUESSED_CONFIDENCE)
     points, confidence = points[usable], confidence[usable]
-    count = min(config.points, len(points))
-    confidence, least = torch.topk(confidence, count, largest=False)
-    points = points[least]
+    confidence, least = torch.topk(confidence, min(config.points, len(points)), largest=False)
+    points, confidence = points[least].double().T.contiguous(), confidence.double()
     typical = _typical(last)
-    return _Uncertain(points, _covariance(points, confidence, typical, last.K, config), typical)
+    focal = last.K.diagonal()[:2].to(points)
+    return _Uncertain(points, _covariance(points, confidence, typical, focal, config), typical)
 
 
-def _seen_from(candidate: Keyframe, last: Keyframe, prior: _Uncertain,
+def _seen_from(candidates: Sequence[Keyframe], last: Keyframe, prior: _Uncertain,
                config: SigmaConfig) -> _Seen:
-    """The last keyframe's points, in the candidate's rays and its own depth there."""
-    T = sim3.inverse(candidate.T_world_kf) @ last.T_world_kf
-    X = sim3.transform(T, prior.points)
+    """The last keyframe's points, in the candidates' rays and their own depths there."""
+    T = sim3.inverse(torch.stack([kf.T_world_kf for kf in candidates])) @ last.T_world_kf
+    A, t = T[:, :3, :3].to(prior.points), T[:, :3, 3:].to(prior.points)
+    X = A @ prior.points + t   # [C,3,N]
+    owns = [_own(kf, X[k].T) for k, kf in enumerate(candidates)]
+    own, confidence = torch.stack([o.points for o in owns]), torch.stack(
+        [o.confidence for o in owns])
+    # Both depths are in the candidate's unit; where they differ, something stands between.
+    same = torch.log(own[:, 2] / X[:, 2]).abs() < config.depth_tolerance
+    focal = torch.stack([kf.K.diagonal()[:2] for kf in candidates]).to(X)
+    P = A[:, None] @ (A @ prior.covariance.flatten(1)).unflatten(2, (3, -1))   # A P A^T
+    R = _on_rays(_covariance(own, confidence, prior.typical, focal, config), own)
+    # A ray has two degrees of freedom: the floor keeps R invertible along it.
+    R[:, [0, 1, 2], [0, 1, 2]] += config.sigma_ray ** 2
+    return _Seen(_on_rays(P, X), R, same & (confidence > GUESSED_CONFIDENCE))
+
+
+@dataclass(frozen=True)
+class _Own:
+    """A candidate's points [3,N] and their confidence [N], 0 outside its image."""
+
+    points: Tensor
+    confidence: Tensor
+
+
+def _own(candidate: Keyframe, X: Tensor) -> _Own:
+    """Where points X [N,3] in its camera frame appear."""
     uv = camera.project(X, candidate.K)
     height, width = candidate.confidence.shape
     inside = camera.inside(uv, height, width)
     at = torch.where(inside[:, None], uv, torch.zeros_like(uv)).round().long()
-    own = candidate.points_cam[at[:, 1], at[:, 0]].double()
-    confidence = candidate.confidence[at[:, 1], at[:, 0]].double()
-    # Both depths are in the candidate's unit; where they differ, something stands between.
-    same = torch.log(own[:, 2] / X[:, 2]).abs() < config.depth_tolerance
-    visible = inside & same & (confidence > GUESSED_CONFIDENCE)
-    to_ray = rays.ray_derivative(own)
-    noise = _covariance(own, confidence, prior.typical, candidate.K, config)
-    floor = config.sigma_ray ** 2 * torch.eye(3, dtype=X.dtype, device=X.device)
-    # A ray has two degrees of freedom: the floor keeps R invertible along it.
-    return _Seen(rays.ray_derivative(X) @ T[:3, :3].to(X), to_ray @ noise @ to_ray.mT + floor,
-                 visible)
+    at = at[:, 1] * width + at[:, 0]
+    own = candidate.points_cam.reshape(-1, 3).index_select(0, at)
+    confidence = candidate.confidence.reshape(-1).index_select(0, at)
+    return _Own(own.to(X).T, confidence.to(X) * inside)
 
 
-def _covariance(points: Tensor, confidence: Tensor, typical: float, K: Tensor,
+def _covariance(points: Tensor, confidence: Tensor, typical: float, focal: Tensor,
                 config: SigmaConfig) -> Tensor:
-    """Pixel and depth noise through the inverse projection z K^-1 (u, v, 1): [N,3,3].
+    """Pixel and depth noise through the inverse projection z K^-1 (u, v, 1): [...,3,3,N].
 
-    points: [N,3]. confidence: [N], above 1 and accumulated over observations; ``typical`` is what
-    a single observation adds to it, for the unit of a model's confidence is its own.
+    points: [...,3,N]. confidence: [...,N], above 1 and accumulated over observations; ``typical``
+    is what a single observation adds to it, for the unit of a model's confidence is its own.
+    focal: [...,2].
     """
-    z = points[:, 2]
-    J = points.new_zeros(len(points), 3, 3)
-    J[:, 0, 0], J[:, 1, 1] = z / K[0, 0], z / K[1, 1]
-    J[:, :, 2] = points / z[:, None]
-    pixel = torch.full_like(z, config.sigma_px ** 2)
-    depth = (config.sigma_depth * z).square() * typical / (confidence - 1.0)
-    return (J * torch.stack([pixel, pixel, depth], -1)[:, None, :]) @ J.mT
+    across = config.sigma_px * points[..., 2:, :] / focal[..., None]
+    along = points * (config.sigma_depth * (typical / (confidence - 1.0)).sqrt())[..., None, :]
+    covariance = along[..., :, None, :] * along[..., None, :, :]
+    covariance[..., [0, 1], [0, 1], :] += across.square()
+    return covariance
+
+
+def _on_rays(covariance: Tensor, points: Tensor) -> Tensor:
+    """D M D^T [...,3,3,N] of covariances M of points [...,3,N]; D = dr/dX = (I - r r^T)/|X|.
+
+    (I - r r^T) M (I - r r^T) = M - r a^T - a r^T with a = M r - (r^T M r) r / 2.
+    """
+    d2 = points.square().sum(-2, keepdim=True)
+    r = points * d2.rsqrt()
+    Mr = (covariance * r[..., None, :, :]).sum(-2)
+    a = Mr - 0.5 * (r * Mr).sum(-2, keepdim=True) * r
+    cross = r[..., :, None, :] * a[..., None, :, :]
+    return (covariance - cross - cross.transpose(-3, -2)) / d2[..., None, :]
 
 
 def _typical(keyframe: Keyframe) -> float:
@@ -195,5 +230,6 @@ def _typical(keyframe: Keyframe) -> float:
 
 
 def _det(M: Tensor) -> Tensor:
-    """Determinants [...] of [...,3,3], without a decomposition per point."""
-    return (M[..., 0, :] * torch.linalg.cross(M[..., 1, :], M[..., 2, :])).sum(-1)
+    """Determinants [...,N] of [...,3,3,N], without a decomposition per point."""
+    a, b, c = M.unbind(-3)
+    return (a * torch.linalg.cross(b, c, dim=-2)).sum(-2)

@@ -12,7 +12,8 @@ from ..models.base import GeometryModel
 from ..types import Frame, FrameEncoding, Keyframe, WindowPrediction
 from .alignment import observed
 from .keyframe_map import KeyframeMap
-from .sigma import activate, rerank
+from .prioritisation import make_prioritiser
+from .sigma import activate
 from .stages import Stopwatch
 from .tracking import Tracker, TrackingResult, TrackingWindow
 
@@ -42,6 +43,7 @@ class WindowTracker:
 
     def __init__(self, config: Config, model: GeometryModel, tracker: Tracker) -> None:
         self._config = config.sigma
+        self._prioritiser = make_prioritiser(config.sigma)
         self._fusion = config.keyframes
         self._model = model
         self._tracker = tracker
@@ -68,20 +70,19 @@ class WindowTracker:
               keyframes: KeyframeMap, clock: Stopwatch) -> WindowEstimate:
         """The window is chosen around the reference keyframe (paper: the last keyframe)."""
         with clock.stage('prioritise'):
-            reference = keyframes[reference_id]
-            ranked = rerank(reference, keyframes.overlapping(reference_id), self._config)
+            ranked = self._prioritiser.ranked(keyframes[reference_id], keyframes)
         return activate(
-            reference_id, [r.keyframe_id for r in ranked],
+            reference_id, ranked,
             lambda ids: self.estimate(encoding, guess, [keyframes[i] for i in ids], clock),
             lambda estimate, ids: self._reorder(estimate, [keyframes[i] for i in ids], clock),
             self._config).attempt
 
     def _reorder(self, estimate: WindowEstimate, remaining: Sequence[Keyframe],
-                 clock: Stopwatch) -> list[int]:
+                 clock: Stopwatch) -> tuple[int, ...]:
         """The remaining candidates ranked again, the reference as this estimate would leave it."""
         with clock.stage('prioritise'):
             reference = observed(estimate.keyframes[0], estimate.prediction, 1, self._fusion)
-            return [r.keyframe_id for r in rerank(reference, remaining, self._config)]
+            return self._prioritiser.reranked(reference, remaining)
 
     def estimate(self, encoding: FrameEncoding, guess: Tensor | None,
                  keyframes: Sequence[Keyframe], clock: Stopwatch) -> WindowEstimate:

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from .fusion import FeatureFusion, resized
 from .layers import LayerNorm
+from .linear import PixelLinear
 from .place_encoding import place_encoding
 from .sizes import PATCH_PX, VggtSizes
 
@@ -23,7 +24,8 @@ class _Scratch(nn.Module):
             self.add_module(f'refinenet{level}', FeatureFusion(dim, merges=level < len(channels)))
         self.output_conv1 = nn.Conv2d(dim, dim // 2, 3, padding=1)
         self.output_conv2 = nn.Sequential(
-            nn.Conv2d(dim // 2, _HIDDEN, 3, padding=1), nn.ReLU(), nn.Conv2d(_HIDDEN, 2, 1))
+            nn.Conv2d(dim // 2, _HIDDEN, 3, padding=1), nn.ReLU(inplace=True),
+            PixelLinear(_HIDDEN, 2))
 
     def forward(self, pyramid: list[Tensor]) -> Tensor:
         """Levels 1 to 4, [V,C_i,h_i,w_i], to features [V,dim/2,2*h_1,2*w_1]."""
@@ -45,7 +47,7 @@ class DepthHead(nn.Module):
         channels = sizes.dpt_channels
         self._specials = sizes.specials
         self.norm = LayerNorm(2 * sizes.dim)
-        self.projects = nn.ModuleList(nn.Conv2d(2 * sizes.dim, c, 1) for c in channels)
+        self.projects = nn.ModuleList(PixelLinear(2 * sizes.dim, c) for c in channels)
         # Four times as fine as the patches, twice, the same, half.
         self.resize_layers = nn.ModuleList([
             nn.ConvTranspose2d(channels[0], channels[0], 4, stride=4),
@@ -75,4 +77,5 @@ class DepthHead(nn.Module):
 
 
 def _placed(x: Tensor, aspect: float) -> Tensor:
-    return x + place_encoding(x.shape[1], x.shape[2], x.shape[3], aspect, str(x.device))
+    """x, of which nobody else needs the old values, and where its pixels are."""
+    return x.add_(place_encoding(x.shape[1], x.shape[2], x.shape[3], aspect, str(x.device)))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from .linear import PixelLinear
+
 
 def resized(x: Tensor, size: tuple[int, int]) -> Tensor:
     """[V,C,h,w] to [V,C,*size], bilinear with the corners on the corners."""
@@ -23,7 +25,7 @@ class ResidualUnit(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         x = x.relu()
-        return x + self.conv2(self.conv1(x).relu())
+        return self.conv2(self.conv1(x).relu_()).add_(x)
 
 
 class FeatureFusion(nn.Module):
@@ -34,9 +36,13 @@ class FeatureFusion(nn.Module):
         if merges:
             self.resConfUnit1 = ResidualUnit(dim)
         self.resConfUnit2 = ResidualUnit(dim)
-        self.out_conv = nn.Conv2d(dim, dim, 1)
+        self.out_conv = PixelLinear(dim, dim)
 
     def forward(self, level: Tensor, coarser: Tensor | None, size: tuple[int, int]) -> Tensor:
-        """level, coarser: [V,C,h,w]; returns [V,C,*size]."""
-        x = level if coarser is None else coarser + self.resConfUnit1(level)
-        return self.out_conv(resized(self.resConfUnit2(x), size))
+        """level, coarser: [V,C,h,w]; returns [V,C,*size].
+
+        The last layer comes before the resizing, with a quarter of the pixels: weights of an
+        interpolation add up to 1, so it is the same.
+        """
+        x = level if coarser is None else self.resConfUnit1(level).add_(coarser)
+        return resized(self.out_conv(self.resConfUnit2(x)), size)

@@ -11,14 +11,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from .linear import Linear, linear
 from .rope import rotated
 
-
-class Linear(nn.Linear):
-    """Casts what comes in to the dtype of its weights."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        return F.linear(x.to(self.weight.dtype), self.weight, self.bias)
+_ROWS = 1100    # of hidden activations at a time on the CPU: 18 MB at full size
 
 
 class LayerNorm(nn.LayerNorm):
@@ -29,14 +25,15 @@ class LayerNorm(nn.LayerNorm):
 
 
 class LayerScale(nn.Module):
-    """A learned factor for each channel."""
+    """A learned factor for each channel of what a residual sum adds."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
         self.gamma = nn.Parameter(torch.empty(dim))
 
-    def forward(self, x: Tensor) -> Tensor:
-        return x * self.gamma
+    def forward(self, x: Tensor, change: Tensor) -> Tensor:
+        """x + gamma * change."""
+        return torch.addcmul(x, change, self.gamma)
 
 
 class Mlp(nn.Module):
@@ -48,6 +45,16 @@ class Mlp(nn.Module):
         self.fc2 = Linear(hidden, out)
 
     def forward(self, x: Tensor) -> Tensor:
+        """On the CPU in portions: fresh memory costs more there than what is done with it, and
+        small tensors get what others have left.
+        """
+        portions = -(-x.shape[:-1].numel() // _ROWS) if x.is_cpu else 1
+        if portions == 1:
+            return self._portion(x)
+        parts = x.flatten(0, -2).chunk(portions)
+        return torch.cat([self._portion(part) for part in parts]).view(*x.shape[:-1], -1)
+
+    def _portion(self, x: Tensor) -> Tensor:
         return self.fc2(F.gelu(self.fc1(x)))
 
 
@@ -63,29 +70,32 @@ class Attention(nn.Module):
         self.proj = Linear(dim, dim)
 
     def forward(self, x: Tensor, turns: Tensor | None) -> Tensor:
-        q, k, v = self._split(self.qkv(x), 3)
-        return self._attend(q, k, v, turns, turns)
+        """turns: [2,T,C/heads], see rope.py."""
+        return self.for_rows(x, x, turns, turns)
 
-    def for_rows(self, rows: Tensor, x: Tensor, row_turns: Tensor, turns: Tensor) -> Tensor:
+    def for_rows(self, rows: Tensor, x: Tensor, row_turns: Tensor | None,
+                 turns: Tensor | None) -> Tensor:
         """What ``forward`` gives for some rows [B,R,C] of x, without computing the others."""
-        dim = x.shape[-1]
-        weight, bias = self.qkv.weight, self.qkv.bias
-        rows, x = rows.to(weight.dtype), x.to(weight.dtype)
-        q, = self._split(F.linear(rows, weight[:dim], bias[:dim]), 1)
-        k, v = self._split(F.linear(x, weight[dim:], bias[dim:]), 2)
-        return self._attend(q, k, v, row_turns, turns)
+        q = _turned(self.q_norm(self._part(0, rows)), row_turns)
+        k = _turned(self.k_norm(self._part(1, x)), turns)
+        v = self._part(2, x)
+        out = F.scaled_dot_product_attention(q.to(v.dtype).transpose(1, 2),
+                                             k.to(v.dtype).transpose(1, 2), v.transpose(1, 2))
+        return self.proj(out.transpose(1, 2).flatten(2))
 
-    def _split(self, x: Tensor, parts: int) -> tuple[Tensor, ...]:
-        """[B,T,parts*C] to ``parts`` tensors [B,heads,T,C/heads]."""
-        return x.unflatten(-1, (parts, self._heads, -1)).permute(2, 0, 3, 1, 4).unbind()
+    def _part(self, part: int, x: Tensor) -> Tensor:
+        """Queries (0), keys (1) or values (2) of x [B,T,C]: [B,T,heads,C/heads].
 
-    def _attend(self, q: Tensor, k: Tensor, v: Tensor, q_turns: Tensor | None,
-                k_turns: Tensor | None) -> Tensor:
-        q, k = self.q_norm(q), self.k_norm(k)
-        if q_turns is not None and k_turns is not None:
-            q, k = rotated(q, q_turns), rotated(k, k_turns)
-        x = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
-        return self.proj(x.transpose(1, 2).flatten(2))
+        By itself each is contiguous, as the norms want it.
+        """
+        channels = slice(part * x.shape[-1], (part + 1) * x.shape[-1])
+        y = linear(x, self.qkv.weight[channels], self.qkv.bias[channels])
+        return y.unflatten(-1, (self._heads, -1))
+
+
+def _turned(x: Tensor, turns: Tensor | None) -> Tensor:
+    """x: [B,T,heads,D]."""
+    return x if turns is None else rotated(x, turns[:, :, None])
 
 
 class Block(nn.Module):
@@ -105,11 +115,11 @@ class Block(nn.Module):
 
     def forward(self, x: Tensor, turns: Tensor | None = None) -> Tensor:
         """x: [B,T,C] float32. turns: [2,T,C/heads], see rope.py."""
-        x = x + self.ls1(self.attn(self.norm1(x), turns))
-        return x + self.ls2(self.mlp(self.norm2(x)))
+        x = self.ls1(x, self.attn(self.norm1(x), turns))
+        return self.ls2(x, self.mlp(self.norm2(x)))
 
     def for_rows(self, rows: Tensor, x: Tensor, row_turns: Tensor, turns: Tensor) -> Tensor:
         """What ``forward`` gives for some rows [B,R,C] of x."""
         out = self.attn.for_rows(self.norm1(rows), self.norm1(x), row_turns, turns)
-        rows = rows + self.ls1(out)
-        return rows + self.ls2(self.mlp(self.norm2(rows)))
+        rows = self.ls1(rows, out)
+        return self.ls2(rows, self.mlp(self.norm2(rows)))

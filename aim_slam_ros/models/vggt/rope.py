@@ -17,9 +17,10 @@ _BASE = 100.0
 
 
 def rotated(x: Tensor, turns: Tensor) -> Tensor:
-    """x: [...,T,D] turned by turns: [2,T,D]."""
-    partner = x.unflatten(-1, (2, 2, -1)).flip(-2).flatten(-3)
-    return x * turns[0] + partner * turns[1]
+    """x: [...,D] turned by turns: [2,...,D]."""
+    a, b, c, d = x.chunk(4, -1)
+    partner = torch.cat([b, a, d, c], -1)
+    return torch.addcmul(x * turns[0], partner, turns[1])
 
 
 @lru_cache(maxsize=16)

@@ -1,0 +1,1 @@
+"""Settings and methods compared over sequences and seeds."""

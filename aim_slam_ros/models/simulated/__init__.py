@@ -1,0 +1,1 @@
+"""An instrument: a foundation model simulated from recorded depth and poses, never a default."""
