@@ -190,7 +190,7 @@ class TrackingConfig(Section):
     tracker: str = setting(
         'image', "refine matches in the images, or the paper's joint Sim(3) solve",
         choices=('image', 'paper'))
-    stride: int = setting(16, 'every so many pixels of a keyframe are matched [px]', 1, 64)
+    stride: int = setting(12, 'every so many pixels of a keyframe are matched [px]', 1, 64)
     sigma_px: float = setting(
         1.0, 'standard deviation of a refined match [px]; calibrates kappa', 0.05, 10)
     min_matches: int = setting(60, 'fewer refined matches than this: keep the pose mean',
