@@ -216,6 +216,9 @@ class KeyframesConfig(Section):
     max_fuse_spread: float = setting(
         0.15, 'a prediction whose log depth ratios to the keyframe scatter more is not fused',
         0.01, 2)
+    shared_focal: bool = setting(
+        True, 'all images of a camera share one focal length, the mean of what the model says of '
+        'each; otherwise every keyframe averages its own, as in the paper')
     fuse: bool = setting(
         True, "average a keyframe's pointmap and focal length with what later inferences say")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import box_room
 import pytest
@@ -137,6 +138,17 @@ def test_the_focal_length_is_averaged_over_all_observations() -> None:
     uv = camera.project(got.points_cam, got.K)
     grid = camera.pixel_grid(box_room.HEIGHT, box_room.WIDTH)
     assert torch.allclose(uv, grid, atol=1e-2), 'points stay where they were seen'
+
+
+def test_a_shared_focal_length_is_taken_as_it_is_known_by_now() -> None:
+    T = box_room.trajectory(1)[0]
+    keyframe, prediction = box_room.keyframe(0, T, observations=3), box_room.prediction([T], UNIT)
+    prediction = replace(prediction, K=prediction.K.clone())
+    prediction.K[:, [0, 1], [0, 1]] *= 1.1
+    shared, own = (observed(keyframe, prediction, 0, KeyframesConfig(shared_focal=shared))
+                   for shared in (True, False))
+    assert float(shared.K[0, 0] / keyframe.K[0, 0]) == pytest.approx(1.1)
+    assert float(own.K[0, 0] / keyframe.K[0, 0]) == pytest.approx(1.025)
 
 
 def test_fusion_can_be_switched_off() -> None:

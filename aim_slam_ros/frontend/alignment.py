@@ -53,14 +53,16 @@ def observed(keyframe: Keyframe, prediction: WindowPrediction, view: int,
     unit = unit_of(keyframe, prediction, view)
     if not unit.count or unit.spread > config.max_fuse_spread:
         return keyframe
-    return fused(keyframe, prediction, view, unit.scale)
+    return fused(keyframe, prediction, view, unit.scale, config.shared_focal)
 
 
-def fused(keyframe: Keyframe, prediction: WindowPrediction, view: int, scale: float) -> Keyframe:
+def fused(keyframe: Keyframe, prediction: WindowPrediction, view: int, scale: float,
+          shared_focal: bool = False) -> Keyframe:
     """The keyframe with one more observation: confidence-weighted averages (paper, III-D).
 
     Points are averaged in log depth along the keyframe's own rays, which keeps them on the rays
-    they were seen on; the focal length is averaged recursively.
+    they were seen on. The focal length is the prediction's where that is the camera's, as known by
+    now; otherwise it is averaged recursively.
     """
     depth = keyframe.points_cam[..., 2]
     weight = prediction.confidence[view] - 1.0
@@ -68,6 +70,8 @@ def fused(keyframe: Keyframe, prediction: WindowPrediction, view: int, scale: fl
     step = weight / total.clamp_min(1e-6) * torch.log(scale * prediction.depth[view] / depth)
     n = keyframe.observations
     K = keyframe.K.clone()
-    K[:2, :2] = (n * K[:2, :2] + prediction.K[view][:2, :2]) / (n + 1)
+    K[:2, :2] = prediction.K[view][:2, :2]
+    if not shared_focal:
+        K[:2, :2] = (n * keyframe.K[:2, :2] + K[:2, :2]) / (n + 1)
     points = camera.unproject(depth * torch.exp(step), K)
     return replace(keyframe, points_cam=points, confidence=1.0 + total, K=K, observations=n + 1)

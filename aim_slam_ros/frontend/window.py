@@ -13,6 +13,7 @@ from ..types import Frame, FrameEncoding, Keyframe, WindowPrediction
 from .alignment import observed
 from .keyframe_map import KeyframeMap
 from .prioritisation import make_prioritiser
+from .shared_focal import SharedFocal
 from .sigma import activate
 from .stages import Stopwatch
 from .tracking import Tracker, TrackingResult, TrackingWindow
@@ -47,6 +48,7 @@ class WindowTracker:
         self._fusion = config.keyframes
         self._model = model
         self._tracker = tracker
+        self._focal = SharedFocal(config.keyframes)
         self.inferences = 0
         self.rotation_only_inferences = 0
 
@@ -59,9 +61,10 @@ class WindowTracker:
             return self._model.encode(frame)
 
     def infer(self, encodings: Sequence[FrameEncoding], clock: Stopwatch) -> WindowPrediction:
-        """One inference, counted and timed."""
+        """One inference, counted and timed, with the camera's focal length."""
         with clock.stage('infer'):
             prediction = self._model.infer(encodings)
+        prediction = self._focal.applied(prediction, encodings[0].frame)
         self.inferences += 1
         self.rotation_only_inferences += prediction.rotation_only
         return prediction
