@@ -41,6 +41,6 @@ setup(
     cmdclass={'develop': Develop},
     entry_points={'console_scripts': [
         f'{name} = {NAME}.cli.{name}:main'
-        for name in ('frontend', 'loop_closure', 'slam', 'ablate', 'convert', 'demo',
-                     'download_weights', 'evaluate', 'play')]},
+        for name in ('frontend', 'loop_closure', 'slam', 'ablate', 'calibrate', 'convert',
+                     'demo', 'download_weights', 'evaluate', 'play')]},
 )

@@ -74,8 +74,9 @@ class VggtConfig(Section):
 class SimulatedConfig(Section):
     preset: str = setting(
         'vggt', 'errors of the simulated model: those of a foundation model, half, twice as '
-        'large, or with the same depth warp in all inferences of an image',
-        choices=('vggt', 'mild', 'harsh', 'correlated'))
+        'large, or with the same depth warp in all inferences of an image; none leaves those of '
+        'the recording itself',
+        choices=('vggt', 'mild', 'harsh', 'correlated', 'none'))
 
 
 @dataclass(frozen=True)
@@ -190,9 +191,12 @@ class TrackingConfig(Section):
     tracker: str = setting(
         'image', "refine matches in the images, or the paper's joint Sim(3) solve",
         choices=('image', 'paper'))
-    stride: int = setting(12, 'every so many pixels of a keyframe are matched [px]', 1, 64)
+    stride: int = setting(16, 'every so many pixels of a keyframe are matched [px]', 1, 64)
     sigma_px: float = setting(
-        1.0, 'standard deviation of a refined match [px]; calibrates kappa', 0.05, 10)
+        1.0, 'standard deviation of a refined match [px]', 0.05, 10)
+    sigma_model_px: float = setting(
+        4.5, "standard deviation of a match at the pose that the model's window gives the image; "
+        'kappa is in its unit (calibrate finds it) [px]', 0.05, 100)
     min_matches: int = setting(60, 'fewer refined matches than this: keep the pose mean',
                                10, 100000)
     max_stray: float = setting(

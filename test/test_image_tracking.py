@@ -60,6 +60,32 @@ def test_the_images_correct_the_models_poses(clip: Clip) -> None:
     assert got.moved == {}
 
 
+def test_kappa_is_how_far_off_the_model_is_in_the_images(clip: Clip) -> None:
+    """A turn of .01 rad about the optical axis moves a pixel by that share of its distance from
+    the middle; the pose that is found stays the same. A right model leaves the noise of the
+    matches and of the stored depths, below a pixel."""
+    turn = torch.tensor([0, 0, 0, 0, 0, 0.01, 0], dtype=torch.float64)
+    right, wrong = (_track(clip, _prediction(clip, error), clip.T_world_cam[CURRENT],
+                           tracking__sigma_model_px=1.0) for error in (None, turn))
+    assert right.kappa < 1.0
+    frame = clip.frame(CURRENT)
+    spread = math.hypot(frame.height, frame.width) / math.sqrt(12.0)   # of a filled rectangle
+    assert wrong.kappa == pytest.approx(0.5 * (0.01 * spread) ** 2, rel=0.5)
+    assert torch.allclose(right.T_world_frame, wrong.T_world_frame, atol=1e-6)
+    calmer = _track(clip, _prediction(clip, turn), clip.T_world_cam[CURRENT],
+                    tracking__sigma_model_px=3.0)
+    assert calmer.kappa == pytest.approx(wrong.kappa / 9.0)
+
+
+def test_a_model_that_places_nothing_cannot_be_worse(clip: Clip) -> None:
+    """The images found the pose from where it was followed to: it counts, and kappa asks for
+    more views."""
+    prediction = _prediction(clip)
+    prediction.confidence[1:] = 1.001
+    got = _track(clip, prediction, clip.T_world_cam[CURRENT])
+    assert got.ok and got.optimised and got.kappa == math.inf
+
+
 def test_each_keyframe_measures_for_itself(clip: Clip) -> None:
     got = _track(clip, _prediction(clip, ERROR))
     assert set(got.measured) == {0, 1}
@@ -77,7 +103,7 @@ def test_a_guess_goes_before_the_models_pose(clip: Clip) -> None:
 
 def test_with_too_few_matches_the_start_is_kept(clip: Clip) -> None:
     got = _track(clip, _prediction(clip, ERROR), tracking__min_matches=50000)
-    assert got.ok and got.kappa == math.inf and got.measured == {}
+    assert got.ok and not got.optimised and got.kappa == math.inf and got.measured == {}
     # the keyframes' errors, seen from the current view
     assert 0.05 < _errors(got.T_world_frame, clip)[1] < 0.15
 

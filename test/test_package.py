@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-COMMANDS = ('ablate', 'convert', 'demo', 'download_weights', 'evaluate', 'play')
+COMMANDS = ('ablate', 'calibrate', 'convert', 'demo', 'download_weights', 'evaluate', 'play')
 EXECUTABLES = ('frontend', 'loop_closure', 'slam', *COMMANDS)
 SOURCES = ('aim_slam_ros', 'msg_adapters', 'config', 'launch', 'resource', 'Makefile', 'setup.py',
            'setup.cfg', 'package.xml', 'requirements.txt', 'requirements-dev.txt',

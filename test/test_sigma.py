@@ -138,7 +138,7 @@ def _activate(kappas: Sequence[float | None], ids: Sequence[int],
     """Attempts that give these kappas in turn; None is one that does not track."""
     script = iter(kappas)
 
-    def attempt(window: tuple[int, ...]) -> _Scripted:
+    def attempt(window: tuple[int, ...], before: _Scripted | None) -> _Scripted:
         kappa = next(script)
         return _Scripted(0.0, ok=False) if kappa is None else _Scripted(kappa)
 
@@ -159,6 +159,17 @@ def test_a_window_grows_while_kappa_falls() -> None:
 def test_a_window_has_at_most_five_views() -> None:
     got = _activate([5.0, 4.0, 3.0], [6, 5, 4, 3, 2, 1])
     assert len(got.window) == 4 and got.attempt.kappa == 3.0
+
+
+def test_an_attempt_knows_which_one_it_widens() -> None:
+    seen: list[tuple[tuple[int, ...], _Scripted | None]] = []
+
+    def attempt(window: tuple[int, ...], before: _Scripted | None) -> _Scripted:
+        seen.append((window, before))
+        return _Scripted(5.0 - len(seen))
+    sigma.activate(9, [7, 5, 4], attempt, lambda _, remaining: remaining, CONFIG)
+    assert seen == [((9, 7), None), ((9, 7, 5), _Scripted(4.0)),
+                    ((9, 7, 5, 4), _Scripted(3.0))]
 
 
 def test_an_unhelpful_view_takes_the_window_back_to_three() -> None:

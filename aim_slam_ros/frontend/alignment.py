@@ -28,7 +28,8 @@ def unit_of(keyframe: Keyframe, prediction: WindowPrediction, view: int) -> Scal
 def pose_mean(window: TrackingWindow, min_seen: float) -> Tensor | None:
     """The mean over the keyframes of where the model puts the frame: Sim(3) [4,4], or None.
 
-    Views of which the model saw a smaller share than min_seen have no say.
+    Views of which the model saw a smaller share than min_seen have no say; the others count by
+    that share and their confidence.
     """
     prediction, guesses, weights = window.prediction, [], []
     for view, keyframe in enumerate(window.keyframes, 1):
@@ -39,7 +40,7 @@ def pose_mean(window: TrackingWindow, min_seen: float) -> Tensor | None:
         T_kf_first = sim3.with_scale(sim3.identity(), unit.scale) \
             @ sim3.inverse(prediction.T_first_cam[view])
         guesses.append(keyframe.T_world_kf @ T_kf_first)
-        weights.append(seen)
+        weights.append(seen * float(prediction.confidence[view, ::_GRID, ::_GRID].mean() - 1.0))
     if not guesses:
         return None
     return sim3.mean(torch.stack(guesses), torch.tensor(weights, dtype=torch.float64))

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..config import FollowingConfig, TrackingConfig
-from ..geometry import sim3
+from ..geometry import camera, sim3
 from ..registration.rigid import RigidSolution, solve_rigid
 from ..registration.scale import log_depth_ratio
 from .alignment import pose_mean
@@ -32,20 +32,20 @@ class ImageTracker:
 
     def track(self, window: TrackingWindow) -> TrackingResult:
         """Keyframes stay where they are. Fails where neither model nor images place the frame."""
-        guess = window.T_world_frame_guess
-        if guess is None:
-            guess = pose_mean(window, self._min_seen)
+        modelled = pose_mean(window, self._min_seen)
+        guess = modelled if window.T_world_frame_guess is None else window.T_world_frame_guess
         if guess is None:
             return _failed('the model connected the image with no keyframe of its window')
         rigid_start = sim3.rigid_part(guess)
         matches, solution = self._refined(window, rigid_start)
         if solution is None or self._strays(rigid_start, solution, matches):
-            return self._fallback(window, matches)
+            return _fallback(window, matches, modelled)
         scale = self._scale(window, matches, solution.T_cam_ref, solution.inliers)
         if not scale:
-            return self._fallback(window, matches)
+            return _fallback(window, matches, modelled)
         return TrackingResult(
-            True, sim3.with_scale(sim3.inverse(solution.T_cam_ref), scale), solution.kappa,
+            True, sim3.with_scale(sim3.inverse(solution.T_cam_ref), scale),
+            self._kappa(window, matches, solution, modelled),
             matches.best_fraction(solution.inliers),
             measured=self._measured(window, matches, solution))
 
@@ -80,6 +80,25 @@ class ImageTracker:
                                 weight.sqrt() * torch.from_numpy(matches.weight[rows]))
         return ratio.scale if ratio.count else 0.0
 
+    def _kappa(self, window: TrackingWindow, matches: PredictedMatches, solution: RigidSolution,
+               T_world_frame: Tensor | None) -> float:
+        """Reduced chi-square of the matches at the pose that the model gives the image.
+
+        How well the window's inference explains the images. After the solve only the noise of
+        the matches is left, which says nothing of the model and does not fall with more views.
+        """
+        if T_world_frame is None:
+            return math.inf
+        rows = solution.inliers
+        points = sim3.transform(sim3.inverse(sim3.rigid_part(T_world_frame)),
+                                torch.from_numpy(matches.points_world[rows]))
+        uv = camera.project(points, window.prediction.K[0])
+        squared = (uv - torch.from_numpy(matches.uv[rows])).square().sum(-1)
+        squared = squared[torch.isfinite(squared)]      # behind the camera there is no pixel
+        freedom = 2 * len(squared) - 6
+        return float(squared.sum()) / (freedom * self._config.sigma_model_px ** 2) \
+            if freedom > 0 else math.inf
+
     def _measured(self, window: TrackingWindow, matches: PredictedMatches,
                   joint: RigidSolution) -> dict[int, Tensor]:
         """T_kf_frame of each keyframe that has matches enough for a solution of its own."""
@@ -97,14 +116,16 @@ class ImageTracker:
                     @ sim3.with_scale(sim3.inverse(alone.T_cam_ref), scale)
         return measured
 
-    def _fallback(self, window: TrackingWindow, matches: PredictedMatches) -> TrackingResult:
-        """Where the images add nothing: the pose it was followed to, else the model's own."""
-        start, guess = pose_mean(window, self._min_seen), window.T_world_frame_guess
-        if start is None:
-            return _failed(f'only {len(matches.uv)} matches were found in the images and the '
-                           'model did not connect the window')
-        T = start if guess is None else sim3.with_scale(guess, sim3.scale_of(start))
-        return TrackingResult(True, T, math.inf, matches.best_fraction(None))
+
+def _fallback(window: TrackingWindow, matches: PredictedMatches,
+              modelled: Tensor | None) -> TrackingResult:
+    """Where the images add nothing: the pose it was followed to, else the model's own."""
+    if modelled is None:
+        return _failed(f'only {len(matches.uv)} matches were found in the images and the '
+                       'model did not connect the window')
+    guess = window.T_world_frame_guess
+    T = modelled if guess is None else sim3.with_scale(guess, sim3.scale_of(modelled))
+    return TrackingResult(True, T, math.inf, matches.best_fraction(None), optimised=False)
 
 
 def _failed(reason: str) -> TrackingResult:

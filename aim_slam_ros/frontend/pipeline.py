@@ -283,7 +283,7 @@ class FrontendPipeline:
 
 def _pose(followed: Followed, estimate: WindowEstimate | None) -> Tensor | None:
     """Rigid T_world_cam: the images' word before the model's; None where both are silent."""
-    if estimate is not None and estimate.ok and math.isfinite(estimate.kappa):
+    if estimate is not None and estimate.ok and estimate.result.optimised:
         return sim3.rigid_part(estimate.result.T_world_frame)
     return followed.T_world_cam if followed.ok else None
 

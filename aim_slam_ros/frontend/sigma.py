@@ -79,21 +79,22 @@ def rerank(last: Keyframe, candidates: Sequence[Keyframe], config: SigmaConfig,
 
 
 def activate(last_id: int, candidates: Sequence[int],
-             attempt: Callable[[tuple[int, ...]], A],
+             attempt: Callable[[tuple[int, ...], A | None], A],
              reorder: Callable[[A, tuple[int, ...]], Sequence[int]],
              config: SigmaConfig) -> Activation[A]:
     """Stage 3: start from config.min_window views, that is from the current frame, the last
     keyframe and the best candidate, and add while kappa asks for it.
 
     candidates: ids, best first; empty where there is only one keyframe. attempt: infers and
-    tracks with the window's keyframe ids. reorder: the remaining ids, best first, after an
-    attempt has updated the keyframes. A window grows while kappa > config.kappa and each addition
-    lowers it; the first addition that does not, takes it back to where it started.
+    tracks with the window's keyframe ids, given the attempt that it widens, if any. reorder: the
+    remaining ids, best first, after an attempt has updated the keyframes. A window grows while
+    kappa > config.kappa and each addition lowers it; the first addition that does not, takes it
+    back to where it started.
     """
     remaining = tuple(k for k in candidates if k != last_id)
     beside = min(config.min_window, config.max_window) - 2
     window, remaining = (last_id, *remaining[:beside]), remaining[beside:]
-    first = best = Activation(attempt(window), window, (window,))
+    first = best = Activation(attempt(window, None), window, (window,))
     while (remaining and len(best.window) + 1 < config.max_window
            and _kappa(best.attempt) > config.kappa):
         remaining = tuple(reorder(best.attempt, remaining))
@@ -101,7 +102,7 @@ def activate(last_id: int, candidates: Sequence[int],
             break
         window, remaining = (*best.window, remaining[0]), remaining[1:]
         tried = (*best.tried, window)
-        wider = Activation(attempt(window), window, tried)
+        wider = Activation(attempt(window, best.attempt), window, tried)
         if not _kappa(wider.attempt) < _kappa(best.attempt):
             return Activation(first.attempt, first.window, tried)
         best = wider

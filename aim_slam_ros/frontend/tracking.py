@@ -32,7 +32,8 @@ class TrackingResult:
     prediction's unit, to the world. kappa: reduced chi-square of the optimisation.
     matched_fraction: share of the current frame that a keyframe of the window sees too.
     moved: new T_world_kf of the keyframes that moved. measured: T_kf_frame [4,4] Sim(3) as each
-    keyframe alone measures it, for the pose graph. reason: why ``ok`` is false, for a person.
+    keyframe alone measures it, for the pose graph. optimised: false where the pose is but a guess.
+    reason: why ``ok`` is false, for a person.
     """
 
     ok: bool
@@ -41,6 +42,7 @@ class TrackingResult:
     matched_fraction: float
     moved: dict[int, Tensor] = field(default_factory=dict)
     measured: dict[int, Tensor] = field(default_factory=dict)
+    optimised: bool = True
     reason: str = ''
 
 

@@ -12,6 +12,7 @@ from ..models.base import GeometryModel
 from ..types import Frame, FrameEncoding, Keyframe, WindowPrediction
 from .alignment import observed
 from .keyframe_map import KeyframeMap
+from .merging import merged
 from .prioritisation import make_prioritiser
 from .shared_focal import SharedFocal
 from .sigma import activate
@@ -76,7 +77,8 @@ class WindowTracker:
             ranked = self._prioritiser.ranked(keyframes[reference_id], keyframes)
         return activate(
             reference_id, ranked,
-            lambda ids: self.estimate(encoding, guess, [keyframes[i] for i in ids], clock),
+            lambda ids, before: self.estimate(encoding, guess, [keyframes[i] for i in ids],
+                                              clock, before),
             lambda estimate, ids: self._reorder(estimate, [keyframes[i] for i in ids], clock),
             self._config).attempt
 
@@ -88,9 +90,15 @@ class WindowTracker:
             return self._prioritiser.reranked(reference, remaining)
 
     def estimate(self, encoding: FrameEncoding, guess: Tensor | None,
-                 keyframes: Sequence[Keyframe], clock: Stopwatch) -> WindowEstimate:
-        """One inference over the image and these keyframes, and its pose."""
+                 keyframes: Sequence[Keyframe], clock: Stopwatch,
+                 narrower: WindowEstimate | None = None) -> WindowEstimate:
+        """One inference over the image and these keyframes, and its pose.
+
+        narrower: an estimate with the first of these keyframes, that this one adds to.
+        """
         prediction = self.infer([encoding, *(k.encoding for k in keyframes)], clock)
+        if narrower is not None:
+            prediction = merged(prediction, narrower.prediction)
         with clock.stage('track'):
             result = self._tracker.track(
                 TrackingWindow(encoding.frame, prediction, tuple(keyframes), guess))

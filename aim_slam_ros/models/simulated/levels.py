@@ -39,5 +39,6 @@ PRESETS = {
     'vggt': ErrorLevels(),
     'mild': ErrorLevels().times(0.5),
     'harsh': ErrorLevels().times(2.0),
+    'none': ErrorLevels().times(0.0),
     'correlated': replace(ErrorLevels(), lasting_warp=True),
 }
