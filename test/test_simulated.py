@@ -160,7 +160,7 @@ class TestErrorLevels:
         assert len(set(alone)) == 3
 
     def test_without_errors_it_tells_the_truth(self) -> None:
-        model = SimulatedModel(Plane(), ErrorLevels().times(0.0))
+        model = _model('none')
         window = _encodings(model, (3, 1, 2))
         prediction = model.infer(window)
         # float32: one part in 10^7, through a logarithm and back
