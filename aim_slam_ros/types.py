@@ -194,7 +194,8 @@ class FrameResult:
     reference_id, T_kf_cam: the keyframe it was tracked against and the pose in its frame (in the
     keyframe's unit, rigid): what survives a later correction of the keyframe.
     events: the keyframes that this image led to. window: keyframe ids of the inference, if any.
-    kappa: reduced chi-square of its optimisation. stage_s: seconds spent in each stage.
+    kappa: reduced chi-square of the window, as its tracker defines it. stage_s: seconds spent in
+    each stage.
     late: images that waited for the map to begin and were placed in it now, oldest first.
     reason: why it was skipped or lost, for a person.
     """

@@ -65,14 +65,18 @@ def fused(keyframe: Keyframe, prediction: WindowPrediction, view: int, scale: fl
     they were seen on. The focal length is the prediction's where that is the camera's, as known by
     now; otherwise it is averaged recursively.
     """
-    depth = keyframe.points_cam[..., 2]
-    weight = prediction.confidence[view] - 1.0
-    total = (keyframe.confidence - 1.0) + weight
-    step = weight / total.clamp_min(1e-6) * torch.log(scale * prediction.depth[view] / depth)
+    own, weight = keyframe.confidence - 1.0, prediction.confidence[view] - 1.0
+    depth = log_mean(keyframe.points_cam[..., 2], own, scale * prediction.depth[view], weight)
     n = keyframe.observations
     K = keyframe.K.clone()
     K[:2, :2] = prediction.K[view][:2, :2]
     if not shared_focal:
         K[:2, :2] = (n * keyframe.K[:2, :2] + K[:2, :2]) / (n + 1)
-    points = camera.unproject(depth * torch.exp(step), K)
-    return replace(keyframe, points_cam=points, confidence=1.0 + total, K=K, observations=n + 1)
+    return replace(keyframe, points_cam=camera.unproject(depth, K), K=K,
+                   confidence=1.0 + own + weight, observations=n + 1)
+
+
+def log_mean(depth: Tensor, weight: Tensor, other: Tensor, other_weight: Tensor) -> Tensor:
+    """The weighted mean of log depths, as a depth; all of one shape, in one unit."""
+    share = other_weight / (weight + other_weight).clamp_min(1e-6)
+    return depth * torch.exp(share * torch.log(other / depth))

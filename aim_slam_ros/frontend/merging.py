@@ -14,6 +14,7 @@ from torch import Tensor
 from ..geometry import sim3
 from ..registration.scale import log_depth_ratio
 from ..types import GUESSED_CONFIDENCE, WindowPrediction
+from .alignment import log_mean
 
 _GRID = 8   # every eighth pixel, both ways, tells the units apart
 
@@ -33,14 +34,11 @@ def merged(wider: WindowPrediction, narrower: WindowPrediction) -> WindowPredict
                            _grid((own * other).clamp_min(0.0).sqrt()))
     if not unit.count:
         return wider
-    total = own + other
-    step = other / total.clamp_min(1e-6) * torch.log(unit.scale * narrower.depth
-                                                     / wider.depth[:n])
     depth, confidence = wider.depth.clone(), wider.confidence.clone()
-    depth[:n] *= torch.exp(step)
+    depth[:n] = log_mean(wider.depth[:n], own, unit.scale * narrower.depth, other)
     # Two guesses are no observation.
     guessed = torch.maximum(own, other) < GUESSED_CONFIDENCE - 1.0
-    confidence[:n] = 1.0 + torch.where(guessed, torch.maximum(own, other), total)
+    confidence[:n] = 1.0 + torch.where(guessed, torch.maximum(own, other), own + other)
     return replace(wider, depth=depth, confidence=confidence,
                    T_first_cam=_poses(wider, narrower, unit.scale))
 

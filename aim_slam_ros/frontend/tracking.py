@@ -29,7 +29,8 @@ class TrackingResult:
     """Where the current frame is.
 
     T_world_frame: [4,4] float64 Sim(3); it maps the current frame's predicted points, in the
-    prediction's unit, to the world. kappa: reduced chi-square of the optimisation.
+    prediction's unit, to the world. kappa: reduced chi-square (paper, stability criterion): of the
+    optimisation, or of what it started from where the tracker says so.
     matched_fraction: share of the current frame that a keyframe of the window sees too.
     moved: new T_world_kf of the keyframes that moved. measured: T_kf_frame [4,4] Sim(3) as each
     keyframe alone measures it, for the pose graph. optimised: false where the pose is but a guess.
