@@ -191,7 +191,8 @@ class TrackingConfig(Section):
     tracker: str = setting(
         'image', "refine matches in the images, or the paper's joint Sim(3) solve",
         choices=('image', 'paper'))
-    stride: int = setting(16, 'every so many pixels of a keyframe are matched [px]', 1, 64)
+    stride: int = setting(
+        16, 'every so many pixels of a keyframe are matched [px at a width of 518]', 1, 64)
     sigma_px: float = setting(
         1.0, 'standard deviation of a refined match [px]', 0.05, 10)
     sigma_model_px: float = setting(

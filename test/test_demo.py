@@ -151,7 +151,8 @@ def test_of_all_bags_the_last_few_used_are_kept(room: Path, cache: Path) -> None
 
 def test_both_nodes_leave_everything(room: Path, tmp_path: Path, cache: Path) -> None:
     out = tmp_path / 'deep' / 'out'
-    output, errors = process(str(room), '--out', str(out), *QUICK,
+    # slower than QUICK: at 10 images a second a slow machine loses the camera as the map begins
+    output, errors = process(str(room), '--out', str(out), *QUICK, '--rate', '0.4',
                              '--keep-bag').communicate(timeout=120)
     lines = output.splitlines()
     assert lines[-1] == str(out / 'report.png'), errors

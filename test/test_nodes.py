@@ -129,7 +129,8 @@ def _check_surface(robot: Robot, clip: Clip) -> None:
 
 
 def _check_keyframes(robot: Robot) -> None:
-    """Every keyframe's cloud, put where TF has its camera at its stamp, is where points are."""
+    """A keyframe's cloud, put where the event has its camera, is where points are; and TF has it
+    there at its stamp, as well as following can tell before the model has been asked."""
     wait_for(lambda: robot.loop_closure_says('keyframes') == str(robot.frontend_has()),
              'loop closure to know all keyframes')
     wait_for(lambda: robot.map and robot.map[-1].width > 1000 and robot.path
@@ -140,13 +141,15 @@ def _check_keyframes(robot: Robot) -> None:
     T_odom_cam = {stamp_ns(p.header.stamp): matrix(p.pose) for p in robot.poses}
     newest = max(set(received) & set(_stamps(robot.points)) & set(T_odom_cam))
     event = received[newest]
-    scale = float(sim3.scale_of(event.T_world_kf))
-    at_camera = scale * event.points_cam[::2, ::2].reshape(-1, 3).double()
-    expected = sim3.transform(T_odom_cam[newest], at_camera)
+    at_camera = event.points_cam[::2, ::2].reshape(-1, 3).double()
+    expected = sim3.transform(T_ZUP_OPTICAL @ event.T_world_kf, at_camera)
+    depth = float(sim3.scale_of(event.T_world_kf) * at_camera[:, 2].median())
     message = next(m for m in robot.points if stamp_ns(m.header.stamp) == newest)
     seen = torch.from_numpy(cloud_from_msg(message).points).double()
     gap = torch.cdist(seen[::50], expected).min(dim=1).values
-    assert float(gap.max()) < 1e-3 * float(at_camera[:, 2].median()), 'of the depth: float32'
+    assert float(gap.max()) < 1e-3 * depth, 'of the depth: float32'
+    moved = (T_ZUP_OPTICAL @ event.T_world_kf - T_odom_cam[newest])[:3, 3].norm()
+    assert float(moved) < 0.05 * depth
 
 
 def _check_late_loop_closure(robot: Robot, clip: Clip, first: Process, folder: Path) -> None:

@@ -52,8 +52,10 @@ class ImageTracker:
     def _refined(self, window: TrackingWindow,
                  T_world_cam: Tensor) -> tuple[PredictedMatches, RigidSolution | None]:
         K = window.prediction.K[0]
-        matches = predict_matches(window.keyframes, window.frame.grey, K, T_world_cam,
-                                  self._config.stride, self._following.sigma_depth)
+        # As many in a small image: a solve needs their number, not their distance.
+        stride = max(1, round(self._config.stride * window.frame.width / 518.0))
+        matches = predict_matches(window.keyframes, window.frame.grey, K, T_world_cam, stride,
+                                  self._following.sigma_depth)
         if len(matches.uv) < self._config.min_matches:
             return matches, None
         return matches, solve_rigid(matches.points_world, matches.uv, K,
