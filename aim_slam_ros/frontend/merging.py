@@ -36,9 +36,9 @@ def merged(wider: WindowPrediction, narrower: WindowPrediction) -> WindowPredict
         return wider
     depth, confidence = wider.depth.clone(), wider.confidence.clone()
     depth[:n] = log_mean(wider.depth[:n], own, unit.scale * narrower.depth, other)
+    better = torch.maximum(own, other)
     # Two guesses are no observation.
-    guessed = torch.maximum(own, other) < GUESSED_CONFIDENCE - 1.0
-    confidence[:n] = 1.0 + torch.where(guessed, torch.maximum(own, other), own + other)
+    confidence[:n] = 1.0 + torch.where(better < GUESSED_CONFIDENCE - 1.0, better, own + other)
     return replace(wider, depth=depth, confidence=confidence,
                    T_first_cam=_poses(wider, narrower, unit.scale))
 
