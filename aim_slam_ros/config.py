@@ -224,6 +224,9 @@ class KeyframesConfig(Section):
     shared_focal: bool = setting(
         True, 'all images of a camera share one focal length, the mean of what the model says of '
         'each; otherwise every keyframe averages its own, as in the paper')
+    device: str = setting(
+        'cpu', 'where pointmaps are kept, ranked, matched and fused: cpu, auto (the GPU where '
+        'there is one), cuda or cuda:N. On a GPU a keyframe takes 3.2 MB of its memory')
     fuse: bool = setting(
         True, "average a keyframe's pointmap and focal length with what later inferences say")
 

@@ -8,13 +8,14 @@ frame they are expressed in: a monocular map has no metres of its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
 from typing import Any, Mapping
 
 import cv2
 import numpy as np
+import torch
 from torch import Tensor
 
 
@@ -78,6 +79,10 @@ class WindowPrediction:
     K: Tensor
     T_first_cam: Tensor
     rotation_only: bool = False
+
+    def to(self, device: torch.device) -> WindowPrediction:
+        """With the images there; cameras stay on the CPU, where single matrices belong."""
+        return replace(self, depth=self.depth.to(device), confidence=self.confidence.to(device))
 
     def seen_share(self, view: int) -> float:
         """Share of the view's pixels whose depth was seen; 0 for a view that did not connect."""

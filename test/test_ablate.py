@@ -12,8 +12,8 @@ from typing import Sequence
 
 import numpy as np
 import pytest
-import torch
-from clip import SIZE, Clip, make
+from clip import SIZE, Clip
+from true_model import TrueModel
 
 from aim_slam_ros import offline
 from aim_slam_ros.ablation.baselines import averaged, chained
@@ -27,16 +27,11 @@ from aim_slam_ros.config import Config, ConfigError
 from aim_slam_ros.datasets import load_sequence
 from aim_slam_ros.datasets.rendered import render
 from aim_slam_ros.evaluation.trajectory import TrajectoryError, compare
-from aim_slam_ros.types import Frame, FrameEncoding, TrackingStatus, WindowPrediction
+from aim_slam_ros.types import FrameEncoding, TrackingStatus, WindowPrediction
 
 ROOT = Path(__file__).resolve().parents[1]
 PRESET = ROOT / 'benchmark' / 'ablations.yaml'
 QUICK = ['--set', 'camera.width=280']
-
-
-@pytest.fixture(scope='module')
-def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
-    return make(tmp_path_factory.mktemp('data') / 'clip')
 
 
 @pytest.fixture(scope='module')
@@ -150,32 +145,6 @@ def test_figures_come_back_and_damaged_ones_do_not(tmp_path: Path) -> None:
 
 
 # The model's own poses.
-
-class TrueModel:
-    """Answers with the truth, in another unit each time."""
-
-    min_views = 1
-
-    def __init__(self, clip: Clip) -> None:
-        self._clip = clip
-        self._asked = 0
-        self.widest = 0
-
-    def encode(self, frame: Frame) -> FrameEncoding:
-        return FrameEncoding(frame, torch.ones(1), self._clip.stamps_ns.index(frame.stamp_ns))
-
-    def infer(self, encodings: Sequence[FrameEncoding]) -> WindowPrediction:
-        self._asked += 1
-        self.widest = max(self.widest, len(encodings))
-        unit = 1.0 + 0.5 * (self._asked % 3)
-        views = [encoding.features for encoding in encodings]
-        poses = torch.stack([self._clip.T_a_b(views[0], view) for view in views])
-        poses[:, :3, 3] /= unit
-        frames = [encoding.frame for encoding in encodings]
-        depth = torch.stack([self._clip.depth_of(view) for view in views]) / unit
-        return WindowPrediction(depth, torch.full_like(depth, 5.0), torch.stack(
-            [frame.K for frame in frames if frame.K is not None]), poses)
-
 
 class OneWrongView(TrueModel):
     """Puts the third view of a window one metre too far to the right."""

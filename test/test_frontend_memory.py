@@ -3,46 +3,18 @@
 from __future__ import annotations
 
 import gc
-import math
-from typing import Sequence
 
 import clip as clips
-import numpy as np
-import torch
 from clip import Clip
+from true_model import TrueModel
 
 from aim_slam_ros.frontend.pipeline import FrontendPipeline
 from aim_slam_ros.nodes.memory import memory_mb
-from aim_slam_ros.types import (Frame, FrameEncoding, Keyframe, TrackingStatus,
-                                WindowPrediction)
+from aim_slam_ros.types import Keyframe, TrackingStatus
 
 ROUNDS = 5              # there and back again
 STEP_NS = 33_000_000
 SETTLED = 2             # rounds after which the place is known
-
-
-class _TrueModel:
-    """The clip's true geometry, in a unit of its own for every inference."""
-
-    min_views = 1
-
-    def __init__(self, clip: Clip) -> None:
-        self._clip = clip
-        self._index = {clip.frame(i).image.tobytes(): i for i in range(len(clip))}
-        self._rng = np.random.default_rng(0)
-
-    def encode(self, frame: Frame) -> FrameEncoding:
-        return FrameEncoding(frame, clips.tiny_descriptor(frame.image), None)
-
-    def infer(self, encodings: Sequence[FrameEncoding]) -> WindowPrediction:
-        at = [self._index[e.frame.image.tobytes()] for e in encodings]
-        unit = math.exp(0.3 * self._rng.standard_normal())
-        depth = torch.stack([self._clip.depth_of(i) for i in at]) / unit
-        T = torch.stack([self._clip.T_a_b(at[0], i) for i in at])
-        T[:, :3, 3] /= unit
-        K = encodings[0].frame.K
-        assert K is not None
-        return WindowPrediction(depth, torch.full(depth.shape, 5.0), K.expand(len(at), 3, 3), T)
 
 
 def _walk(pipeline: FrontendPipeline, clip: Clip, number: int) -> None:
@@ -63,7 +35,7 @@ def _held_mb(keyframe: Keyframe) -> float:
 
 
 def test_memory_follows_the_place_and_not_the_time(clip: Clip) -> None:
-    pipeline = FrontendPipeline(clips.config(), _TrueModel(clip))
+    pipeline = FrontendPipeline(clips.config(), TrueModel(clip))
     keyframes, memory = [], []
     for number in range(ROUNDS):
         _walk(pipeline, clip, number)

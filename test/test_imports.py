@@ -14,12 +14,13 @@ PACKAGES = ('aim_slam_ros', 'msg_adapters')
 EVERYTHING = ('aim_slam_ros', 'msg_adapters')
 
 # What a room may import, besides itself. A name covers what lies below it.
-_BASE = ('types', 'config', 'geometry')
+_BASE = ('types', 'config', 'devices', 'geometry')
 _ROOMS = {
     '__init__': (),
     'types': (),
     'settings': (),
     'config': ('settings',),
+    'devices': ('settings',),
     'geometry': ('types',),
     'registration': _BASE,
     'models': _BASE,

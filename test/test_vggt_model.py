@@ -14,6 +14,7 @@ from torch import Tensor
 from vggt_tiny import HEIGHT, WIDTH, fixture_path, frame, write_checkpoint
 
 from aim_slam_ros.config import Config, ConfigError
+from aim_slam_ros.devices import chosen_device
 from aim_slam_ros.frontend.pipeline import FrontendPipeline
 from aim_slam_ros.geometry import camera, sim3
 from aim_slam_ros.models import make_model
@@ -274,13 +275,13 @@ class TestMaking:
             make_model(self._config(model__weights=str(tmp_path / 'no.pt')))
 
     def test_devices(self) -> None:
-        assert making.chosen_device('cpu').type == 'cpu'
+        assert chosen_device('model.device', 'cpu').type == 'cpu'
         auto = 'cuda' if torch.cuda.is_available() else 'cpu'
-        assert making.chosen_device('auto').type == auto
+        assert chosen_device('model.device', 'auto').type == auto
         with pytest.raises(ConfigError, match='model.device.*expected auto'):
-            making.chosen_device('gpu')
+            chosen_device('model.device', 'gpu')
         with pytest.raises(ConfigError, match='model.device: cuda:99 is not there'):
-            making.chosen_device('cuda:99')
+            chosen_device('model.device', 'cuda:99')
 
     def test_precision_of_the_cpu_is_float32(self) -> None:
         assert making.chosen_dtype('auto', torch.device('cpu')) == torch.float32

@@ -76,8 +76,8 @@ class ImageTracker:
         """From the prediction's unit to the world's, at these matches; 0 where unknown."""
         z = sim3.transform(T_cam_world, torch.from_numpy(matches.points_world[rows]))[:, 2]
         u, v = np.rint(matches.uv[rows]).astype(np.int64).T
-        predicted = window.prediction.depth[0][v, u]
-        weight = (window.prediction.confidence[0][v, u] - 1.0).clamp_min(0.0)
+        predicted = window.prediction.depth[0][v, u].cpu()
+        weight = (window.prediction.confidence[0][v, u].cpu() - 1.0).clamp_min(0.0)
         ratio = log_depth_ratio(z, predicted,
                                 weight.sqrt() * torch.from_numpy(matches.weight[rows]))
         return ratio.scale if ratio.count else 0.0

@@ -143,7 +143,7 @@ class KeyframeMap:
 
 def _displacement(old: Keyframe, new: Keyframe) -> float:
     """How far the middle of what it sees moved, relative to its distance."""
-    middle = old.points_cam[::8, ::8].reshape(-1, 3).nanmedian(dim=0).values.double()
+    middle = old.points_cam[::8, ::8].reshape(-1, 3).nanmedian(dim=0).values.cpu().double()
     a, b = (sim3.transform(k.T_world_kf, middle) for k in (old, new))
     reach = (a - sim3.translation_of(old.T_world_kf)).norm().clamp_min(1e-9)
     return float((a - b).norm() / reach)

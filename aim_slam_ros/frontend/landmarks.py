@@ -42,12 +42,12 @@ class Landmarks:
     def points(self, keyframe: Keyframe) -> np.ndarray:
         """[N,3] float64 in the keyframe's unit, from its pointmap as it is now."""
         u, v = self._pixels()
-        return keyframe.points_cam[v, u].double().numpy()
+        return keyframe.points_cam[v, u].cpu().double().numpy()
 
     def relative_sigma(self, keyframe: Keyframe, sigma_at_mean: float) -> np.ndarray:
         """[N] relative standard deviation of their depths."""
         u, v = self._pixels()
-        return relative_depth_sigma(keyframe.confidence[v, u], keyframe.mean_confidence,
+        return relative_depth_sigma(keyframe.confidence[v, u].cpu(), keyframe.mean_confidence,
                                     sigma_at_mean).numpy()
 
     def _pixels(self) -> tuple[np.ndarray, np.ndarray]:
@@ -75,7 +75,7 @@ class LandmarkCache:
         grey = keyframe.frame.grey
         # Corners whose depth is among the worst known would only vote for a wrong pose.
         floor = float(torch.quantile(keyframe.confidence[::4, ::4].reshape(-1), 0.2))
-        mask = (keyframe.confidence >= floor).numpy().astype(np.uint8)
+        mask = (keyframe.confidence >= floor).cpu().numpy().astype(np.uint8)
         mask[:8], mask[-8:], mask[:, :8], mask[:, -8:] = 0, 0, 0, 0
         corners = cv2.goodFeaturesToTrack(grey, self._config.points, 0.003,
                                           self._config.spacing_px, mask=mask)

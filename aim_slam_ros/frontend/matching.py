@@ -51,11 +51,11 @@ def _of_one(keyframe: Keyframe, grey: np.ndarray, K: Tensor, T_world_cam: Tensor
             sigma_depth: float) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Grid points offered, and per match: point, spread (world), pixel, weight."""
     width = keyframe.frame.width
-    at = camera.grid_indices(keyframe.frame.height, width, stride)
-    confidence = keyframe.confidence.reshape(-1).index_select(0, at)
+    at = camera.grid_indices(keyframe.frame.height, width, stride, str(keyframe.confidence.device))
+    confidence = keyframe.confidence.reshape(-1).index_select(0, at).cpu()
+    points = keyframe.points_cam.reshape(-1, 3).index_select(0, at).cpu()
     seen = confidence >= torch.quantile(confidence, 0.2).clamp_min(GUESSED_CONFIDENCE)
-    at, confidence = at[seen], confidence[seen]
-    points = keyframe.points_cam.reshape(-1, 3).index_select(0, at).double()
+    at, confidence, points = at.cpu()[seen], confidence[seen], points[seen].double()
     uv_kf = torch.stack([at % width, at // width], -1).float().numpy()
     sigma = relative_depth_sigma(confidence, keyframe.mean_confidence, sigma_depth).double()
     world = sim3.transform(keyframe.T_world_kf, points)

@@ -49,7 +49,7 @@ def _poses(wider: WindowPrediction, narrower: WindowPrediction, unit: float) -> 
     for view in range(1, len(narrower.depth)):
         both = torch.stack([wider.T_first_cam[view], narrower.T_first_cam[view]])
         both[1, :3, 3] *= unit
-        weights = torch.stack([_grid(p.confidence[view]).double().mean() - 1.0
+        weights = torch.stack([_grid(p.confidence[view]).double().mean().cpu() - 1.0
                                for p in (wider, narrower)])
         if float(weights.sum()) > 0.0:
             T[view] = sim3.mean(both, weights)

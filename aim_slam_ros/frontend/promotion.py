@@ -53,7 +53,9 @@ class Promotion:
             return self._add(encoding, estimate.prediction, 0, estimate.result.T_world_frame)
         if not followed.ok:
             return None
-        points, confidence = _carried(encoding.frame, followed, K)
+        device = estimate.prediction.depth.device
+        points, confidence = (image.to(device)
+                              for image in _carried(encoding.frame, followed, K))
         return self._map.add(encoding, K, points, confidence, followed.T_world_cam)
 
     def has_depth(self, estimate: WindowEstimate) -> bool:
@@ -97,7 +99,7 @@ class Promotion:
         """The event once more, as the keyframe is now, with the edges as they were measured."""
         return KeyframeEvent(
             keyframe.keyframe_id, keyframe.piece_id, keyframe.stamp_ns, keyframe.frame.image,
-            keyframe.K, keyframe.points_cam, keyframe.confidence, keyframe.T_world_kf,
+            keyframe.K, keyframe.points_cam.cpu(), keyframe.confidence.cpu(), keyframe.T_world_kf,
             keyframe.encoding.descriptor, self._edges[keyframe.keyframe_id])
 
 

@@ -74,7 +74,7 @@ def rerank(last: Keyframe, candidates: Sequence[Keyframe], config: SigmaConfig,
     per_point = 0.5 * torch.log(_det(seen.R + seen.predicted) / _det(seen.R))
     visible = seen.visible & torch.isfinite(per_point)
     gains = torch.where(visible, per_point, torch.zeros_like(per_point)).sum(-1)
-    ranked = [Ranked(kf.keyframe_id, float(gain)) for kf, gain in zip(others, gains)]
+    ranked = [Ranked(kf.keyframe_id, gain) for kf, gain in zip(others, gains.cpu().tolist())]
     return sorted(ranked, key=lambda r: (-r.gain, -r.keyframe_id))
 
 

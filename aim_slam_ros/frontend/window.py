@@ -8,6 +8,7 @@ from typing import Sequence
 from torch import Tensor
 
 from ..config import Config
+from ..devices import chosen_device
 from ..models.base import GeometryModel
 from ..types import Frame, FrameEncoding, Keyframe, WindowPrediction
 from .alignment import observed
@@ -40,7 +41,8 @@ class WindowEstimate:
 class WindowTracker:
     """Prioritises keyframes, infers, tracks, and adds keyframes while that helps.
 
-    The only place that asks the model, so that every inference is counted.
+    The only place that asks the model, so that every inference is counted, and brought to the
+    device that pointmaps are kept on. Raises ConfigError where that is not there.
     """
 
     def __init__(self, config: Config, model: GeometryModel, tracker: Tracker) -> None:
@@ -49,6 +51,7 @@ class WindowTracker:
         self._fusion = config.keyframes
         self._model = model
         self._tracker = tracker
+        self._device = chosen_device('keyframes.device', config.keyframes.device)
         self._focal = SharedFocal(config.keyframes)
         self.inferences = 0
         self.rotation_only_inferences = 0
@@ -64,7 +67,7 @@ class WindowTracker:
     def infer(self, encodings: Sequence[FrameEncoding], clock: Stopwatch) -> WindowPrediction:
         """One inference, counted and timed, with the camera's focal length."""
         with clock.stage('infer'):
-            prediction = self._model.infer(encodings)
+            prediction = self._model.infer(encodings).to(self._device)
         prediction = self._focal.applied(prediction, encodings[0].frame)
         self.inferences += 1
         self.rotation_only_inferences += prediction.rotation_only

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .layers import Block, LayerNorm, Mlp
-from .linear import Linear
+from .products import Linear
 from .sizes import VggtSizes
 
 POSE_SIZE = 9     # translation, quaternion, two fields of view; see pose_encoding.py

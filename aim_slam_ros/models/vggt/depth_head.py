@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from .fusion import FeatureFusion, resized
 from .layers import LayerNorm
-from .linear import PixelLinear
+from .products import PixelLinear
 from .place_encoding import place_encoding
 from .sizes import PATCH_PX, VggtSizes
 

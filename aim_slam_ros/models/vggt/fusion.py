@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .linear import PixelLinear
+from .products import PixelLinear
 
 
 def resized(x: Tensor, size: tuple[int, int]) -> Tensor:

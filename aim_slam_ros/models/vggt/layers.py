@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .linear import Linear, linear
+from .products import Linear, attention, linear
 from .rope import rotated
 
 _ROWS = 1100    # of hidden activations at a time on the CPU: 18 MB at full size
@@ -79,9 +79,7 @@ class Attention(nn.Module):
         q = _turned(self.q_norm(self._part(0, rows)), row_turns)
         k = _turned(self.k_norm(self._part(1, x)), turns)
         v = self._part(2, x)
-        out = F.scaled_dot_product_attention(q.to(v.dtype).transpose(1, 2),
-                                             k.to(v.dtype).transpose(1, 2), v.transpose(1, 2))
-        return self.proj(out.transpose(1, 2).flatten(2))
+        return self.proj(attention(q.to(v.dtype), k.to(v.dtype), v).flatten(2))
 
     def _part(self, part: int, x: Tensor) -> Tensor:
         """Queries (0), keys (1) or values (2) of x [B,T,C]: [B,T,heads,C/heads].

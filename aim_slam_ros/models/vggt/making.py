@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from ...config import Config, ConfigError
+from ...devices import chosen_device
 from .checkpoint import HOW_TO_GET
 from .loading import load_vggt
 from .model import VggtModel
@@ -21,7 +22,7 @@ def make_vggt(config: Config) -> VggtModel:
     if not config.model.weights:
         raise ConfigError('model.weights: the vggt model needs the path of its weights; '
                           f'{HOW_TO_GET}')
-    device = chosen_device(config.model.device)
+    device = chosen_device('model.device', config.model.device)
     dtype = chosen_dtype(config.vggt.precision, device)
     network = load_vggt(Path(config.model.weights).expanduser(), device, dtype)
     if config.vggt.compile:
@@ -29,22 +30,6 @@ def make_vggt(config: Config) -> VggtModel:
     if device.type == 'cpu':
         _log.warning('VGGT runs on the CPU: an inference takes tens of seconds')
     return VggtModel(network, config.vggt.cached_frames, config.camera.fov_deg)
-
-
-def chosen_device(name: str) -> torch.device:
-    """``auto`` is the GPU where there is one. Raises ConfigError."""
-    if name == 'auto':
-        return torch.device('cuda' if torch.cuda.is_available() else 'cpu')
-    try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise ConfigError(f'model.device: {name!r} is not allowed; expected auto, cpu, cuda or '
-                          'cuda:N') from error
-    if device.type == 'cuda' and (device.index or 0) >= torch.cuda.device_count():
-        raise ConfigError(f'model.device: {name} is not there: torch {torch.__version__} sees '
-                          f'{torch.cuda.device_count()} CUDA GPUs. Set it to cpu, or install the '
-                          "GPU's driver and a CUDA build of torch")
-    return device
 
 
 def chosen_dtype(name: str, device: torch.device) -> torch.dtype:
