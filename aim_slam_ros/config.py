@@ -192,13 +192,13 @@ class TrackingConfig(Section):
         'image', "refine matches in the images, or the paper's joint Sim(3) solve",
         choices=('image', 'paper'))
     stride: int = setting(
-        16, 'every so many pixels of a keyframe are matched [px at a width of 518]', 1, 64)
+        24, 'every so many pixels of a keyframe are matched [px at a width of 518]', 1, 64)
     sigma_px: float = setting(
         1.0, 'standard deviation of a refined match [px]', 0.05, 10)
     sigma_model_px: float = setting(
         4.5, "standard deviation of a match at the pose that the model's window gives the image; "
         'kappa is in its unit (calibrate finds it) [px]', 0.05, 100)
-    min_matches: int = setting(60, 'fewer refined matches than this: keep the pose mean',
+    min_matches: int = setting(40, 'fewer refined matches than this: keep the pose mean',
                                10, 100000)
     max_stray: float = setting(
         0.15, 'how far the solve may move the camera from its start, relative to the median '

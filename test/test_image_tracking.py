@@ -88,10 +88,10 @@ def test_a_model_that_places_nothing_cannot_be_worse(clip: Clip) -> None:
 
 def test_each_keyframe_measures_for_itself(clip: Clip) -> None:
     got = _track(clip, _prediction(clip, ERROR))
-    assert set(got.measured) == {0, 1}
+    assert set(got.measured()) == {0, 1}
     for keyframe_id, index in enumerate(KEYFRAMES):
         T_world_kf = sim3.with_scale(clip.T_world_cam[index], UNITS[keyframe_id])
-        _, position, scale = _errors(T_world_kf @ got.measured[keyframe_id], clip)
+        _, position, scale = _errors(T_world_kf @ got.measured()[keyframe_id], clip)
         assert position < 0.03 and scale < 0.03
 
 
@@ -103,7 +103,7 @@ def test_a_guess_goes_before_the_models_pose(clip: Clip) -> None:
 
 def test_with_too_few_matches_the_start_is_kept(clip: Clip) -> None:
     got = _track(clip, _prediction(clip, ERROR), tracking__min_matches=50000)
-    assert got.ok and not got.optimised and got.kappa == math.inf and got.measured == {}
+    assert got.ok and not got.optimised and got.kappa == math.inf and got.measured() == {}
     # the keyframes' errors, seen from the current view
     assert 0.05 < _errors(got.T_world_frame, clip)[1] < 0.15
 
@@ -124,4 +124,4 @@ def test_where_nobody_knows_it_says_why(clip: Clip, guessed: bool) -> None:
     far[:3, 3] += 40.0
     got = _track(clip, prediction, far if guessed else None)
     assert not got.ok and isinstance(got.reason, str) and got.reason
-    assert got.measured == {} and got.moved == {}
+    assert got.measured() == {} and got.moved == {}

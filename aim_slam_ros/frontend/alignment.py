@@ -10,7 +10,7 @@ from torch import Tensor
 from ..config import KeyframesConfig
 from ..geometry import camera, sim3
 from ..registration.scale import ScaleEstimate, log_depth_ratio
-from ..types import Keyframe, WindowPrediction
+from ..types import GUESSED_CONFIDENCE, Keyframe, WindowPrediction
 from .tracking import TrackingWindow
 
 _GRID = 8   # every eighth pixel, both ways: medians need no more
@@ -73,10 +73,16 @@ def fused(keyframe: Keyframe, prediction: WindowPrediction, view: int, scale: fl
     if not shared_focal:
         K[:2, :2] = (n * keyframe.K[:2, :2] + K[:2, :2]) / (n + 1)
     return replace(keyframe, points_cam=camera.unproject(depth, K), K=K,
-                   confidence=1.0 + own + weight, observations=n + 1)
+                   confidence=1.0 + together(own, weight), observations=n + 1)
 
 
 def log_mean(depth: Tensor, weight: Tensor, other: Tensor, other_weight: Tensor) -> Tensor:
     """The weighted mean of log depths, as a depth; all of one shape, in one unit."""
     share = other_weight / (weight + other_weight).clamp_min(1e-6)
     return depth * torch.exp(share * torch.log(other / depth))
+
+
+def together(own: Tensor, other: Tensor) -> Tensor:
+    """Confidences above 1 of two observations add up; two guesses are no observation."""
+    better = torch.maximum(own, other)
+    return torch.where(better < GUESSED_CONFIDENCE - 1.0, better, own + other)

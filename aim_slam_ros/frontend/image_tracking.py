@@ -7,6 +7,7 @@ Matches that come from the inference whose poses are then optimised carry no new
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import torch
@@ -47,7 +48,7 @@ class ImageTracker:
             True, sim3.with_scale(sim3.inverse(solution.T_cam_ref), scale),
             self._kappa(window, matches, solution, modelled),
             matches.best_fraction(solution.inliers),
-            measured=self._measured(window, matches, solution))
+            measured=partial(self._measured, window, matches, solution))
 
     def _refined(self, window: TrackingWindow,
                  T_world_cam: Tensor) -> tuple[PredictedMatches, RigidSolution | None]:

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from ..geometry import sim3
 from ..registration.scale import log_depth_ratio
-from ..types import GUESSED_CONFIDENCE, WindowPrediction
-from .alignment import log_mean
+from ..types import WindowPrediction
+from .alignment import log_mean, together
 
 _GRID = 8   # every eighth pixel, both ways, tells the units apart
 
@@ -36,9 +36,7 @@ def merged(wider: WindowPrediction, narrower: WindowPrediction) -> WindowPredict
         return wider
     depth, confidence = wider.depth.clone(), wider.confidence.clone()
     depth[:n] = log_mean(wider.depth[:n], own, unit.scale * narrower.depth, other)
-    better = torch.maximum(own, other)
-    # Two guesses are no observation.
-    confidence[:n] = 1.0 + torch.where(better < GUESSED_CONFIDENCE - 1.0, better, own + other)
+    confidence[:n] = 1.0 + together(own, other)
     return replace(wider, depth=depth, confidence=confidence,
                    T_first_cam=_poses(wider, narrower, unit.scale))
 

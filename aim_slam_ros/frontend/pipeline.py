@@ -252,7 +252,7 @@ class FrontendPipeline:
         if self._references.main_id == reference_id:    # else later images found a better one
             self._references.main_id = keyframe.keyframe_id
         # What was measured is in the inference's unit; a carried pointmap is in the world's.
-        measured = estimate.result.measured if self._promotion.has_depth(estimate) else {}
+        measured = estimate.result.measured() if self._promotion.has_depth(estimate) else {}
         return [self._promotion.event(keyframe, measured, reference_id)]
 
     def _tracked(self, frame: Frame, T_world_cam: Tensor,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Callable, Protocol
 
 from torch import Tensor
 
@@ -32,9 +32,9 @@ class TrackingResult:
     prediction's unit, to the world. kappa: reduced chi-square (paper, stability criterion): of the
     optimisation, or of what it started from where the tracker says so.
     matched_fraction: share of the current frame that a keyframe of the window sees too.
-    moved: new T_world_kf of the keyframes that moved. measured: T_kf_frame [4,4] Sim(3) as each
-    keyframe alone measures it, for the pose graph. optimised: false where the pose is but a guess.
-    reason: why ``ok`` is false, for a person.
+    moved: new T_world_kf of the keyframes that moved. measured: gives T_kf_frame [4,4] Sim(3) as
+    each keyframe alone measures it, for the pose graph. optimised: false where the pose is but a
+    guess. reason: why ``ok`` is false, for a person.
     """
 
     ok: bool
@@ -42,7 +42,7 @@ class TrackingResult:
     kappa: float
     matched_fraction: float
     moved: dict[int, Tensor] = field(default_factory=dict)
-    measured: dict[int, Tensor] = field(default_factory=dict)
+    measured: Callable[[], dict[int, Tensor]] = dict
     optimised: bool = True
     reason: str = ''
 

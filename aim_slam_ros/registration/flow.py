@@ -15,21 +15,26 @@ WINDOW_PX = 21
 LEVELS = 3        # a search over the whole pyramid: reaches some 90 px
 TIGHT_LEVELS = 1  # enough from a prediction that is right within some 12 px
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.02)
+_ROUGHLY = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 8, 0.05)   # the way back
 
 
 @dataclass(frozen=True)
 class FlowMatches:
-    """uv_b: [N,2] float32, where each point was found. valid: [N] bool."""
+    """uv_b: [N,2] float32, where each point was found. valid: [N] bool.
+
+    searched: how many were predicted inside the image.
+    """
 
     uv_b: np.ndarray
     valid: np.ndarray
+    searched: int
 
 
 def _flow(a: np.ndarray, b: np.ndarray, uv_a: np.ndarray, uv_b: np.ndarray,
-          levels: int) -> tuple[np.ndarray, np.ndarray]:
+          levels: int, criteria: tuple[int, int, float]) -> tuple[np.ndarray, np.ndarray]:
     found, status, _ = cv2.calcOpticalFlowPyrLK(
         a, b, uv_a, uv_b.copy(), winSize=(WINDOW_PX, WINDOW_PX), maxLevel=levels,
-        criteria=_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4)
+        criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4)
     return found, status[:, 0].astype(bool)
 
 
@@ -47,17 +52,17 @@ def refine(a: np.ndarray, b: np.ndarray, uv_a: np.ndarray, uv_b_predicted: np.nd
     valid = _inside(uv_b, b)
     rows = np.flatnonzero(valid)
     if rows.size == 0:
-        return FlowMatches(uv_b, valid)
+        return FlowMatches(uv_b, valid, 0)
     start = np.ascontiguousarray(uv_a[rows], np.float32)
-    found, ok = _flow(a, b, start, uv_b[rows], levels)
+    found, ok = _flow(a, b, start, uv_b[rows], levels, _CRITERIA)
     ok &= np.linalg.norm(found - uv_b[rows], axis=1) <= max_move_px
     ok &= _inside(found, b)
     if max_round_trip_px is not None and ok.any():
-        back, back_ok = _flow(b, a, found[ok], start[ok], levels)
+        back, back_ok = _flow(b, a, found[ok], start[ok], levels, _ROUGHLY)
         ok[ok] = back_ok & (np.linalg.norm(back - start[ok], axis=1) <= max_round_trip_px)
     valid[rows] = ok
     uv_b[rows] = found
-    return FlowMatches(uv_b, valid)
+    return FlowMatches(uv_b, valid, len(rows))
 
 
 def _inside(uv: np.ndarray, image: np.ndarray) -> np.ndarray:
