@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 from pathlib import Path
 
 Figures = dict[str, float | None]
+
+
+def parser(doc: str | None) -> argparse.ArgumentParser:
+    """What every benchmark takes; doc: its module's docstring."""
+    made = argparse.ArgumentParser(description=doc,
+                                   formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument('--out', type=Path, required=True, metavar='FOLDER',
+                      help='add to benchmark.json there')
+    return made
 
 
 def said(figures: Figures) -> Figures:

@@ -11,18 +11,16 @@ give at the time.
 
 from __future__ import annotations
 
-import argparse
 import gc
 import math
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Callable, Sequence
 
 import cv2
 import numpy as np
 import torch
-from figures import Figures, add, said
+from figures import Figures, add, parser, said
 from torch import Tensor
 
 from aim_slam_ros.config import Config, SigmaConfig
@@ -108,7 +106,9 @@ class Inputs:
 
 
 def main() -> int:
-    args = _parser().parse_args()
+    arguments = parser(__doc__)
+    arguments.add_argument('--images', type=int, default=120)
+    args = arguments.parse_args()
     sequence = load_sequence('rendered:room')
     count = min(args.images, len(sequence))
     inputs = Inputs([int(s) for s in sequence.stamps_ns[:count]],
@@ -121,14 +121,6 @@ def main() -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     add(args.out, figures)
     return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--out', type=Path, required=True)
-    parser.add_argument('--images', type=int, default=120)
-    return parser
 
 
 def _matmul() -> Figures:

@@ -9,13 +9,11 @@ the images. One figure a line; adds to benchmark.json.
 
 from __future__ import annotations
 
-import argparse
 import gc
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
-from figures import Figures, add, said
+from figures import Figures, add, parser, said
 from frontend import KnownGeometry
 from torch import Tensor
 
@@ -52,7 +50,9 @@ class _Repeated(dict[int, Tensor]):
 
 
 def main() -> int:
-    args = _parser().parse_args()
+    arguments = parser(__doc__)
+    arguments.add_argument('--images', type=int, default=10000)
+    args = arguments.parse_args()
     sequence = load_sequence('rendered:room')
     start = time.perf_counter()
     parts = _walk(sequence, args.images)
@@ -67,14 +67,6 @@ def main() -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     add(args.out, figures)
     return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--out', type=Path, required=True)
-    parser.add_argument('--images', type=int, default=10000)
-    return parser
 
 
 def _walk(sequence: Sequence, count: int) -> list[Part]:

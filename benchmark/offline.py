@@ -9,13 +9,12 @@ Adds to benchmark.json: ``name: number``, the unit in the name.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from figures import Figures, add, said
+from figures import Figures, add, parser, said
 from scipy.spatial import cKDTree
 
 from aim_slam_ros import offline
@@ -47,7 +46,11 @@ CASES = (Case('tum_fr1_xyz', 'tum_fr1_xyz', every_image=True),
 
 
 def main() -> int:
-    args = _parser().parse_args()
+    arguments = parser(__doc__)
+    arguments.add_argument('--data', type=Path, required=True)
+    arguments.add_argument('--seeds', type=int, default=3)
+    arguments.add_argument('--only', nargs='*', choices=[case.name for case in CASES])
+    args = arguments.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     figures: Figures = {}
     for case in CASES:
@@ -62,16 +65,6 @@ def main() -> int:
         figures |= _measure(case, sequence, args.seeds if case.seeds else 1)
     add(args.out, figures)
     return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--data', type=Path, required=True)
-    parser.add_argument('--out', type=Path, required=True)
-    parser.add_argument('--seeds', type=int, default=3)
-    parser.add_argument('--only', nargs='*', choices=[case.name for case in CASES])
-    return parser
 
 
 def _measure(case: Case, sequence: Sequence, seeds: int) -> Figures:

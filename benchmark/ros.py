@@ -10,7 +10,6 @@ Adds to benchmark.json: ``name: number``, the unit in the name.
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
 import subprocess
@@ -21,7 +20,7 @@ from typing import Any, Callable
 
 import numpy as np
 import torch
-from figures import Figures, add, said
+from figures import Figures, add, parser, said
 from rclpy.serialization import deserialize_message, serialize_message
 
 from aim_slam_ros.types import KeyframeEvent
@@ -36,12 +35,10 @@ _DEMO = ('frames_offered', 'dropped_percent', 'tracked_of_delivered_percent', 'l
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--data', type=Path, required=True)
-    parser.add_argument('--out', type=Path, required=True)
-    parser.add_argument('--only', nargs='*', choices=PARTS, default=PARTS)
-    args = parser.parse_args()
+    arguments = parser(__doc__)
+    arguments.add_argument('--data', type=Path, required=True)
+    arguments.add_argument('--only', nargs='*', choices=PARTS, default=PARTS)
+    args = arguments.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     for part in args.only:
         if part == 'messages':

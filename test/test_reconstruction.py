@@ -180,7 +180,7 @@ def test_evaluate_writes_and_prints_the_figures(room: Path, tmp_path: Path,
     # the model sees a few small images: the map is rough, but of the room
     assert 0.0 < figures['reconstruction_accuracy_m'] < CUT_M
     assert 0.0 < figures['reconstruction_completion_m'] < CUT_M
-    assert 'accuracy / completion / chamfer [m]' in capsys.readouterr().out
+    assert 'map accuracy / completion [m]' in capsys.readouterr().out
 
 
 @pytest.mark.skipif(not FR1.is_dir(), reason='needs the recording tum_fr1_xyz')

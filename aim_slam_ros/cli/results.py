@@ -24,7 +24,8 @@ _TRAJECTORY: _Rows = (
     ('tracked_percent', 'tracked [%]', '{:.1f}'),
 )
 _SURFACE: _Rows = (
-    ('surface', 'map: accuracy / completion / chamfer [m]', '{}'),
+    ('surface', 'map accuracy / completion [m]', '{}'),
+    ('reconstruction_chamfer_m', 'map chamfer distance [m]', '{:.3f}'),
 )
 _DELIVERY: _Rows = (
     ('dropped', 'dropped', '{}'),
@@ -85,9 +86,8 @@ def _table(figures: Mapping[str, Metric], run: Run) -> tuple[tuple[str, str], ..
 
 
 def _surface(figures: Mapping[str, Metric]) -> str | None:
-    names = ('accuracy', 'completion', 'chamfer')
-    values = [figures[f'reconstruction_{name}_m'] for name in names]
-    return None if None in values else ' / '.join(f'{value:.4f}' for value in values)
+    values = [figures[f'reconstruction_{name}_m'] for name in ('accuracy', 'completion')]
+    return None if None in values else ' / '.join(f'{value:.3f}' for value in values)
 
 
 def _delivered(figures: Mapping[str, Metric]) -> dict[str, Metric]:

@@ -210,7 +210,7 @@ def _draw_table(axes: Axes, rows: Sequence[tuple[str, str]]) -> None:
     if not rows:
         return
     table = axes.table(cellText=[list(row) for row in rows], cellLoc='left',
-                       colWidths=[0.55, 0.45], bbox=Bbox.unit(), edges='horizontal')
+                       colWidths=[0.6, 0.4], bbox=Bbox.unit(), edges='horizontal')
     table.auto_set_font_size(False)
     table.set_fontsize(10.5)
     for cell in table.get_celld().values():
