@@ -148,12 +148,13 @@ class PoseEdge:
 
 @dataclass(frozen=True)
 class KeyframeEvent:
-    """A new keyframe, as the frontend tells it to loop closure.
+    """A new keyframe, or a known one that was seen more often, as loop closure is told of it.
 
     image: [H,W,3] uint8 RGB, all that is needed to run the model on it again. points_cam and
     confidence as in Keyframe. edges: the relative poses to the older keyframes it was tracked
     against, as measured (a loop-closure correction does not change them). moved: older keyframes
-    whose pose changed in the frontend since the last event.
+    whose pose changed in the frontend since the last event. observations: how many inferences the
+    pointmap is the mean of.
     """
 
     keyframe_id: int
@@ -167,6 +168,7 @@ class KeyframeEvent:
     descriptor: Tensor
     edges: tuple[PoseEdge, ...] = ()
     moved: tuple[KeyframePose, ...] = ()
+    observations: int = 1
 
 
 @dataclass(frozen=True)

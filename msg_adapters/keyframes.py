@@ -4,9 +4,10 @@ This is a public format. All numbers are little-endian; ids count from 0 and are
 ``session_id``, a random number of each run of the frontend. Columns may stand in any order, and a
 reader passes over columns that it does not know.
 
-``keyframe``: unorganised PointCloud2, frame_id the map frame. Row 0 is the new keyframe.
+``keyframe``: unorganised PointCloud2, frame_id the map frame. Row 0 is the keyframe: a new one,
+one that is sent again, or one whose cloud became better by more observations.
 
-    kind           UINT8       0 the new keyframe, 1 an older one that moved, 2 an edge
+    kind           UINT8       0 the keyframe, 1 an older one that moved, 2 an edge
     keyframe_id    UINT32      of the keyframe; of an edge its end a
     other_id       UINT32      of an edge its end b; else 0
     x y z          FLOAT32     kind 0, 1: translation of T_map_keyframe, which leads from the
@@ -18,6 +19,7 @@ reader passes over columns that it does not know.
                                translation [units of a], rotation [rad], log-scale; else 0
     fx fy cx cy    FLOAT32     kind 0: intrinsics [px], pixel centres at integers; else 0
     descriptor     FLOAT32[D]  kind 0: of unit length, for retrieval by cosine similarity; else 0
+    observations   UINT32      kind 0: inferences that its cloud is the mean of; else 0
     piece_id       UINT32      kind 0, 2: connected part of the map; kind 1: 0
     session_id     UINT32
     stamp_sec      INT32       of the new keyframe's image, as in the header
@@ -60,8 +62,8 @@ _POSE = [(name, '<f4') for name in (*TRANSLATION, *QUATERNION, 'scale')]
 _STAMP = [('session_id', '<u4'), ('stamp_sec', '<i4'), ('stamp_nanosec', '<u4')]
 _INTRINSICS = ('fx', 'fy', 'cx', 'cy')
 _KEYFRAME = [*_POSE, ('kind', 'u1'), ('keyframe_id', '<u4'), ('other_id', '<u4'),
-             ('piece_id', '<u4'), *_STAMP, *((name, '<f4') for name in _INTRINSICS),
-             ('sigma', '<f4', (7,))]
+             ('piece_id', '<u4'), ('observations', '<u4'), *_STAMP,
+             *((name, '<f4') for name in _INTRINSICS), ('sigma', '<f4', (7,))]
 _DESCRIPTOR = np.dtype([('descriptor', '<f4')])   # of any length
 _CLOUD = np.dtype([(name, '<f4') for name in ('x', 'y', 'z', 'rgb', 'confidence')])
 _CORRECTION = np.dtype([*_POSE, ('keyframe_id', '<u4'), ('piece_id', '<u4'), ('version', '<u4'),
@@ -121,6 +123,7 @@ def keyframe_messages(event: KeyframeEvent, session_id: int, camera_frame: str,
     rows['piece_id'][0] = rows['piece_id'][first_edge:] = event.piece_id
     for row, edge in zip(rows[first_edge:], event.edges):
         row['other_id'], row['sigma'] = edge.b, edge.sigma.numpy()
+    rows['observations'][0] = event.observations
     K = event.K
     for name, value in zip(_INTRINSICS, (K[0, 0], K[1, 1], K[0, 2], K[1, 2])):
         rows[name][0] = float(value)
@@ -165,7 +168,7 @@ def keyframe_event(table: Any, cloud: Any) -> ReceivedKeyframe:
         points_cam=torch.from_numpy(points_of(pixels, float(new['scale']))),
         confidence=torch.from_numpy(pixels['confidence'].astype(np.float32)),
         T_world_kf=T_world_kf[0], descriptor=_descriptor(new), edges=_edges(rows[relative]),
-        moved=moved)
+        moved=moved, observations=max(1, int(new['observations'])))
     return ReceivedKeyframe(int(new['session_id']), event)
 
 

@@ -51,6 +51,15 @@ def test_new_keyframes_do_not_hide_a_lost_one() -> None:
     assert asked == [2]
 
 
+def test_better_keyframes_do_not_hide_a_lost_one() -> None:
+    gaps = gaps_of(0, 2)
+    asked = []
+    for second in range(5):
+        gaps.received(0, better=True)
+        asked += [second] if gaps.overdue(float(second)) else []
+    assert asked == [2]
+
+
 def test_a_closed_gap_is_forgotten() -> None:
     gaps = gaps_of(0, 2)
     assert asked_at(gaps, 10) == [2, 6]

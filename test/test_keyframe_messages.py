@@ -49,7 +49,7 @@ def _event(edges: int = 2, moved: int = 2, dimension: int = 5) -> KeyframeEvent:
         descriptor=normalize(torch.rand(dimension, generator=generator), dim=0),
         edges=tuple(PoseEdge(11 - i, 12, _pose(20 + i), torch.rand(
             7, dtype=torch.float64, generator=generator) + 0.01) for i in range(edges)),
-        moved=tuple(KeyframePose(7 + i, _pose(30 + i)) for i in range(moved)))
+        moved=tuple(KeyframePose(7 + i, _pose(30 + i)) for i in range(moved)), observations=4)
 
 
 def _messages(event: KeyframeEvent | None = None) -> KeyframeMessages:
@@ -62,8 +62,8 @@ def _assert_close(found: Tensor, expected: Tensor) -> None:
 
 
 def _assert_same(found: KeyframeEvent, event: KeyframeEvent) -> None:
-    assert (found.keyframe_id, found.piece_id, found.stamp_ns) == (
-        event.keyframe_id, event.piece_id, event.stamp_ns)
+    assert (found.keyframe_id, found.piece_id, found.stamp_ns, found.observations) == (
+        event.keyframe_id, event.piece_id, event.stamp_ns, event.observations)
     np.testing.assert_array_equal(found.image, event.image)
     assert torch.equal(found.confidence, event.confidence)
     assert torch.equal(found.descriptor, event.descriptor)

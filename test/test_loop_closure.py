@@ -150,6 +150,21 @@ def test_a_resent_keyframe_changes_nothing() -> None:
     assert torch.equal(stacked(done.pipeline.poses), before)
 
 
+def test_a_keyframe_that_is_known_better_is_shown_so() -> None:
+    events = drifting_events(0.15)[:4]
+    done = walk(events)
+    poses, cloud = stacked(done.pipeline.poses), done.pipeline.fused_map().points
+    better = dataclasses.replace(events[2], points_cam=0.9 * events[2].points_cam)
+    assert done.pipeline.add(better) is None, 'as often seen as before: it was sent again'
+    assert np.array_equal(done.pipeline.fused_map().points, cloud)
+    seen_again = dataclasses.replace(better, observations=3)
+    assert done.pipeline.wants(seen_again) and done.pipeline.add(seen_again) is None
+    assert not done.pipeline.wants(seen_again)
+    expected = walk([*events[:2], better, events[3]]).pipeline.fused_map().points
+    assert np.array_equal(done.pipeline.fused_map().points, expected)
+    assert torch.equal(stacked(done.pipeline.poses), poses)
+
+
 def test_switched_off_it_collects_and_maps_but_asks_nothing() -> None:
     events = drifting_events(0.15)
     done = walk(events, enabled=False)

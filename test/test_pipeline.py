@@ -111,13 +111,24 @@ class TestTracking:
         assert len(begun.events) == 2
 
     def test_keyframes_come_as_events_with_edges(self, run: list[FrameResult]) -> None:
-        events = [e for r in run for e in r.events]
+        events = [e for r in run for e in r.events if e.observations == 1]
         assert [e.keyframe_id for e in events] == list(range(len(events))) and len(events) > 2
         for event in events:
             older = {edge.a for edge in event.edges}
             assert all(edge.b == event.keyframe_id for edge in event.edges)
             assert older <= set(range(event.keyframe_id))
             assert older or event.keyframe_id == 0
+
+    def test_a_keyframe_known_much_better_is_told_again_beside_a_new_one(
+            self, run: list[FrameResult]) -> None:
+        known: dict[int, int] = {}
+        for result in run:
+            for event in result.events:
+                before = known.get(event.keyframe_id, 0)
+                assert event.observations >= 3 * before
+                known[event.keyframe_id] = event.observations
+            assert not result.events or result.events[-1].observations == 1, 'the new one is last'
+        assert max(known.values()) >= 3
 
     def test_edges_agree_with_the_map(self, clip: Clip) -> None:
         pipeline = _pipeline()
@@ -374,8 +385,8 @@ class TestCorrection:
 
     def test_the_next_event_is_in_the_corrected_world(self, clip: Clip,
                                                       run: list[FrameResult]) -> None:
-        new = [e for r in self._corrected(clip) for e in r.events]
-        old = {e.stamp_ns: e for r in run for e in r.events}
+        new = [e for r in self._corrected(clip) for e in r.events if e.observations == 1]
+        old = {e.stamp_ns: e for r in run for e in r.events if e.observations == 1}
         assert new
         common = [e for e in new if e.stamp_ns in old]
         for event in common:

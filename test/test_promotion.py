@@ -185,6 +185,22 @@ def test_an_event_tells_what_loop_closure_needs(clip: Clip) -> None:
     assert math.isclose(metres[0], metres[1], rel_tol=0.2)
 
 
+def test_loop_closure_is_told_of_a_keyframe_that_became_much_better(clip: Clip) -> None:
+    keyframes = clips.true_map(clip, [10, 14])
+    promotion = clips.promotion(keyframes)
+    told = [promotion.event(keyframes[k], {}, 0) for k in (0, 1)]
+    assert [event.observations for event in told] == [1, 1]
+    estimate = _estimate(clip, keyframes, 12, _prediction(clip, [12, 10, 14]))
+    for _ in range(2):
+        assert promotion.refined() == []
+        promotion.learn(estimate)
+    again = promotion.refined()
+    assert [(event.keyframe_id, event.observations) for event in again] == [(0, 3), (1, 3)]
+    assert torch.equal(again[0].confidence, keyframes[0].confidence)
+    assert float(again[0].confidence.min()) > float(told[0].confidence.max())
+    assert promotion.refined() == [], 'once'
+
+
 def test_where_nothing_was_measured_the_map_gives_the_edge(clip: Clip) -> None:
     keyframes = clips.true_map(clip, [10, 13], (1.0, 2.0))
     edge, = clips.promotion(keyframes).event(keyframes[1], {}, 0).edges

@@ -239,7 +239,10 @@ class FrontendPipeline:
 
     def _keep(self, inquiry: TrackingInquiry, findings: Findings, followed: Followed,
               reference_id: int) -> list[KeyframeEvent]:
-        """Fuse the window's keyframes and promote the image where it left its reference."""
+        """Fuse the window's keyframes and promote the image where it left its reference.
+
+        The new keyframe's event is the last one.
+        """
         encoding, estimate = findings.encoding, findings.estimate
         if encoding is None or estimate is None:
             return []
@@ -253,7 +256,8 @@ class FrontendPipeline:
             self._references.main_id = keyframe.keyframe_id
         # What was measured is in the inference's unit; a carried pointmap is in the world's.
         measured = estimate.result.measured() if self._promotion.has_depth(estimate) else {}
-        return [self._promotion.event(keyframe, measured, reference_id)]
+        return [*self._promotion.refined(),
+                self._promotion.event(keyframe, measured, reference_id)]
 
     def _tracked(self, frame: Frame, T_world_cam: Tensor,
                  events: Sequence[KeyframeEvent]) -> FrameResult:

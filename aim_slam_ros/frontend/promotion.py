@@ -22,6 +22,8 @@ from .window import WindowEstimate
 
 _CARRIED = 1.2        # confidence of a depth carried over from older keyframes, at its points
 _BETWEEN = 1.02       # and between them
+_BETTER = 3           # so many times the observations that loop closure was told of: worth telling
+_AT_ONCE = 3          # keyframes told once more beside a new one, megabytes each
 _EDGE_SIGMA = (0.02, 0.02, 0.02, 0.006, 0.006, 0.006, 0.02)   # translation by median depth
 
 
@@ -32,6 +34,7 @@ class Promotion:
         self._config = config
         self._map = keyframes
         self._edges: dict[int, tuple[PoseEdge, ...]] = {}
+        self._told: dict[int, int] = {}     # observations
 
     def begin(self, beginning: Beginning) -> list[Keyframe]:
         """The first keyframes of a piece: the oldest view is the world, then the current one."""
@@ -95,12 +98,20 @@ class Promotion:
         return replace(self.repeated_event(keyframe),
                        moved=self._map.take_moved(keyframe.keyframe_id))
 
+    def refined(self) -> list[KeyframeEvent]:
+        """Keyframes that are known much better than loop closure was told, the most so first."""
+        growth = {i: self._map[i].observations / told for i, told in self._told.items()}
+        most = sorted(growth, key=lambda i: -growth[i])[:_AT_ONCE]
+        return [self.repeated_event(self._map[i]) for i in most if growth[i] >= _BETTER]
+
     def repeated_event(self, keyframe: Keyframe) -> KeyframeEvent:
         """The event once more, as the keyframe is now, with the edges as they were measured."""
+        self._told[keyframe.keyframe_id] = keyframe.observations
         return KeyframeEvent(
             keyframe.keyframe_id, keyframe.piece_id, keyframe.stamp_ns, keyframe.frame.image,
             keyframe.K, keyframe.points_cam.cpu(), keyframe.confidence.cpu(), keyframe.T_world_kf,
-            keyframe.encoding.descriptor, self._edges[keyframe.keyframe_id])
+            keyframe.encoding.descriptor, self._edges[keyframe.keyframe_id],
+            observations=keyframe.observations)
 
 
 def _edge(older: Keyframe, newer_id: int, T_older_newer: Tensor) -> PoseEdge:

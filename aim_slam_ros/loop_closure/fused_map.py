@@ -51,7 +51,7 @@ class FusedMap:
         self._thinned: dict[int, _Thinned] = {}
 
     def add(self, event: KeyframeEvent) -> None:
-        """Take a keyframe in; the work on it waits until a map is asked for."""
+        """Take a keyframe in, or a better one of it; the work waits until a map is asked for."""
         self._pending.append(event)
 
     def _thin_pending(self) -> None:

@@ -45,6 +45,7 @@ class LoopClosurePipeline:
         self._map = FusedMap(self._config)
         self._events: dict[int, KeyframeEvent] = {}
         self._piece_ids: dict[int, int] = {}
+        self._observations: dict[int, int] = {}
         self._waiting: list[PoseEdge] = []
         self._loops: list[AcceptedLoop] = []
         self._rejected: Counter[str] = Counter()
@@ -53,12 +54,17 @@ class LoopClosurePipeline:
     def add(self, event: KeyframeEvent) -> CorrectedKeyframes | None:
         """Take a keyframe in; all corrected poses if it saw an old place again, else None.
 
-        A keyframe that is known already (the frontend was asked to resend) changes nothing.
+        A keyframe that is known already changes nothing where the frontend was asked to resend it;
+        with more observations than before, its cloud in the map becomes the better one.
         Raises PoseGraphError or RetrievalError for an event with unusable numbers.
         """
+        if not self.wants(event):
+            return None
         if event.keyframe_id in self._graph:
+            self._show(event)
             return None
         self._insert(event)
+        self._show(event)
         if self._config.enabled:
             self._events[event.keyframe_id] = event
         again = self._add_edges(event)
@@ -68,6 +74,10 @@ class LoopClosurePipeline:
         loops = [loop for older in candidates if (loop := self._verify(event, older)) is not None]
         self._close(loops)
         return self._optimise() if loops or again else None
+
+    def wants(self, event: KeyframeEvent) -> bool:
+        """Whether the keyframe is new, or known better than when it came."""
+        return event.observations > self._observations.get(event.keyframe_id, 0)
 
     @property
     def loops(self) -> tuple[AcceptedLoop, ...]:
@@ -104,6 +114,10 @@ class LoopClosurePipeline:
         """The corrected world's cloud, in the world's unit."""
         return self._map.fuse(self._graph.poses())
 
+    def _show(self, event: KeyframeEvent) -> None:
+        self._observations[event.keyframe_id] = event.observations
+        self._map.add(event)
+
     def _insert(self, event: KeyframeEvent) -> None:
         # Once the graph has been corrected, its world is not the one the frontend was in when it
         # made this event; the measured edges hold in both.
@@ -115,7 +129,6 @@ class LoopClosurePipeline:
         for moved in event.moved:
             if moved.keyframe_id in self._graph:
                 self._graph.move(moved.keyframe_id, T_graph_frontend @ moved.T_world_kf)
-        self._map.add(event)
 
     def _add_edges(self, event: KeyframeEvent) -> bool:
         """The frontend's own measurements; whether one of them spans a long time.

@@ -85,8 +85,9 @@ class LoopClosureNode(Node):
         if session is None:
             return
         event = received.event
+        better = session.knows(event.keyframe_id) and session.wants(event)
         if self._worker.add(session, event):
-            session.gaps.received(event.keyframe_id)
+            session.gaps.received(event.keyframe_id, better)
         else:
             session.gaps.exists(event.keyframe_id)
             self._statistics.dropped_keyframes += 1

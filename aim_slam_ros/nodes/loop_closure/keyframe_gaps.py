@@ -22,9 +22,9 @@ class KeyframeGaps:
         """How many are known to exist but have not come."""
         return self._count - len(self._received)
 
-    def received(self, keyframe_id: int) -> None:
-        """One that is not the newest comes because they are being sent again."""
-        self._resending |= keyframe_id < self._count - 1
+    def received(self, keyframe_id: int, better: bool = False) -> None:
+        """One that is not the newest, nor better than before, comes because all are sent again."""
+        self._resending |= keyframe_id < self._count - 1 and not better
         self._received.add(keyframe_id)
         self.exists(keyframe_id)
 

@@ -80,6 +80,10 @@ class MapSession:
     def knows(self, keyframe_id: int) -> bool:
         return keyframe_id in self._T_world_kf
 
+    def wants(self, event: KeyframeEvent) -> bool:
+        """Whether the keyframe is new, or known better than when it came."""
+        return self._pipeline.wants(event)
+
     def add(self, event: KeyframeEvent) -> CorrectedKeyframes | None:
         """As LoopClosurePipeline.add; raises PoseGraphError or RetrievalError."""
         self._stamps_ns[event.keyframe_id] = event.stamp_ns

@@ -104,7 +104,7 @@ class MapWorker:
 
     def _add(self, session: MapSession, event: KeyframeEvent, arrived_s: float) -> None:
         try:
-            if not session.forgotten and not session.knows(event.keyframe_id):
+            if not session.forgotten and session.wants(event):
                 self._take(session, event)
                 self._statistics.latency_s = time.monotonic() - arrived_s
         finally:
