@@ -128,6 +128,7 @@ def test_its_life(peer: Peer, tmp_path: Path, clip: clips.Clip) -> None:
         _nothing_to_save(stage)
         _asks_for_keyframes(stage)
         _maps_what_the_frontend_saw(stage, clip)
+        _shows_what_became_better(stage)
         _begins_anew_with_another_session(stage)
         _corrects(stage)
         _forgets_and_asks_again_when_reset(stage)
@@ -194,6 +195,20 @@ def _saves(stage: Stage, images: int, points: int) -> None:
     written = read_tum_trajectory(folder / 'trajectory.txt').T_world_cam
     for T, pose in zip(written, stage.ears.path[-1].poses):
         np.testing.assert_allclose(T, matrix(pose.pose), atol=1e-6)
+
+
+def _shows_what_became_better(stage: Stage) -> None:
+    """Not what is merely sent again."""
+    path, before = len(stage.ears.path[-1].poses), cloud_from_msg(stage.ears.map[-1]).points
+    event = stage.source.events[0]
+    further = dataclasses.replace(event, points_cam=1.1 * event.points_cam)
+    stage.source.send(further)
+    stage.source.send(dataclasses.replace(further, observations=3))
+    wait_for(lambda: not np.array_equal(cloud_from_msg(stage.ears.map[-1]).points, before),
+             'a map with the better keyframe')
+    after = cloud_from_msg(stage.ears.map[-1]).points
+    assert before[:, 0].max() < after[:, 0].max() < 1.2 * before[:, 0].max(), 'ahead, along x'
+    assert len(stage.ears.path[-1].poses) == path and stage.source.requests == 1
 
 
 def _begins_anew_with_another_session(stage: Stage) -> None:
