@@ -64,6 +64,24 @@ def test_a_consistent_window_stays_where_it_is(views: int, pairs: str, residual:
     assert set(got.moved) == set(range(1, views - 1))
 
 
+def test_rounding_does_not_grow_from_window_to_window() -> None:
+    """Each keyframe's pose is made of the inverse of the one before: what is off doubles."""
+    window, tracker = _window(4), JointTracker(CONFIG)
+    off = torch.zeros(4, 4, dtype=torch.float64)
+    off[0, 1] = 1e-9
+    window = replace(window, keyframes=tuple(
+        replace(k, T_world_kf=k.T_world_kf + off) for k in window.keyframes))
+    for _ in range(40):     # 1e-9 doubled 30 times is 1
+        got = tracker.track(window)
+        window = replace(window, keyframes=tuple(
+            replace(k, T_world_kf=got.moved.get(k.keyframe_id, k.T_world_kf))
+            for k in window.keyframes))
+    for T in (got.T_world_frame, *got.moved.values()):
+        R = sim3.rotation_of(T)
+        assert torch.allclose(R @ R.T, torch.eye(3).double(), rtol=0.0, atol=1e-12)
+    assert _errors(got.T_world_frame, _truth(4))[1] < 0.004
+
+
 WRONG = torch.tensor([0.05, -0.03, 0.04, 0.01, -0.012, 0.008, 0.03])   # 1 degree, 7 cm, 3 %
 
 

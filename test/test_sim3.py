@@ -71,6 +71,15 @@ def test_transform_acts_as_scale_rotation_translation_and_keeps_the_dtype() -> N
     assert torch.allclose(moved.double(), expected, atol=1e-5)     # float32 points
 
 
+def test_a_matrix_that_is_nearly_a_member_becomes_one() -> None:
+    T = sim3.exp(tangents())
+    nearly = T + 1e-6 * torch.randn(T.shape, generator=torch.Generator().manual_seed(0)).double()
+    member = sim3.on_group(nearly)
+    assert torch.allclose(member, nearly, rtol=0.0, atol=1e-4)      # scales up to some tens
+    assert close(sim3.inverse(member) @ member, torch.eye(4).double().expand_as(T))
+    assert close(sim3.on_group(T), T)
+
+
 def test_adjoint_carries_a_perturbation_across() -> None:
     T, xi = sim3.exp(tangents(seed=1)), tangents(size=0.3, seed=2)
     carried = (sim3.adjoint(T) @ xi[..., None])[..., 0]

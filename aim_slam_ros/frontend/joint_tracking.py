@@ -82,7 +82,8 @@ class JointTracker:
         T_world = torch.stack([view.T_world for view in views])
         links = sim3.inverse(T_world[:-1]) @ T_world[1:]
         solution = joint_solver.solve(links, pairs, self._config)
-        solved = list(itertools.accumulate(solution.links, torch.matmul, initial=T_world[0]))
+        solved = [sim3.on_group(T) for T in itertools.accumulate(
+            solution.links, torch.matmul, initial=T_world[0])]
         growth = float(sim3.scale_of(solved[-1]) / sim3.scale_of(T_world[-1]))
         if not 1.0 / MAX_SCALE_CHANGE < growth < MAX_SCALE_CHANGE:
             return _failed(f'the scale strayed from its guess by a factor of {growth:.2g}', share)

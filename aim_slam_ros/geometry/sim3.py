@@ -55,6 +55,16 @@ def with_scale(T: Tensor, scale: Tensor | float) -> Tensor:
     return from_parts(scale, rotation_of(T), translation_of(T))
 
 
+def on_group(T: Tensor) -> Tensor:
+    """The member that a matrix [...,4,4] was before rounding moved it away a little.
+
+    ``inverse`` takes its argument for a member: in a chain of poses, each made of the inverse of
+    the one before, what rounding adds grows exponentially.
+    """
+    R = rotation_from_quaternion(quaternion_of(rotation_of(T)))
+    return from_parts(scale_of(T), R, translation_of(T))
+
+
 def inverse(T: Tensor) -> Tensor:
     """[...,4,4] to [...,4,4]."""
     A = T[..., :3, :3]
