@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import defaultdict
 from contextlib import contextmanager
@@ -19,11 +20,14 @@ from aim_slam_ros.evaluation.run_result import (LoopPair, PlacedKeyframe, RunRes
                                                 UnreadableImage)
 from aim_slam_ros.frontend.pipeline import FrontendPipeline
 from aim_slam_ros.loop_closure.pipeline import LoopClosurePipeline
+from aim_slam_ros.loop_closure.pose_graph import PoseGraphError
+from aim_slam_ros.loop_closure.retrieval import RetrievalError
 from aim_slam_ros.models import make_model
 from aim_slam_ros.models.base import GeometryModel
 from aim_slam_ros.recorded_truth import RecordedTruth
-from aim_slam_ros.types import CorrectedKeyframes, FrameResult, Keyframe
+from aim_slam_ros.types import CorrectedKeyframes, FrameResult, Keyframe, KeyframeEvent
 
+_log = logging.getLogger(__name__)
 Progress = Callable[[FrameResult | None], None]
 _LAST = ('loop_closure', 'correct')    # stages that follow those of the frontend
 
@@ -106,12 +110,20 @@ class _Run:
         for stage, seconds in result.stage_s.items():
             self._stage_s[stage] += seconds
         for event in result.events:
-            with self._timed('loop_closure'):
-                correction = self._loop_closure.add(event)
+            correction = self._loop_closed(event)
             if correction is not None:
                 with self._timed('correct'):
                     self._frontend.apply_correction(correction)
         return result
+
+    def _loop_closed(self, event: KeyframeEvent) -> CorrectedKeyframes | None:
+        """As the node does it: one keyframe must not end the run."""
+        with self._timed('loop_closure'):
+            try:
+                return self._loop_closure.add(event)
+            except (PoseGraphError, RetrievalError) as error:
+                _log.warning('keyframe %d is not used: %s', event.keyframe_id, error)
+                return None
 
     def _take_late(self, result: FrameResult) -> None:
         """Images that waited for the map have their poses now; what they cost stays theirs."""

@@ -7,8 +7,9 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
-from typing import Sequence
+from typing import Any, Sequence
 
 import numpy as np
 import pytest
@@ -27,7 +28,8 @@ from aim_slam_ros.config import Config, ConfigError
 from aim_slam_ros.datasets import load_sequence
 from aim_slam_ros.datasets.rendered import render
 from aim_slam_ros.evaluation.trajectory import TrajectoryError, compare
-from aim_slam_ros.types import FrameEncoding, TrackingStatus, WindowPrediction
+from aim_slam_ros.frontend.pipeline import FrontendPipeline
+from aim_slam_ros.types import FrameEncoding, FrameResult, TrackingStatus, WindowPrediction
 
 ROOT = Path(__file__).resolve().parents[1]
 PRESET = ROOT / 'benchmark' / 'ablations.yaml'
@@ -173,6 +175,24 @@ def through(frontend: offline.Frontend, clip: Clip) -> list[float]:
         T_true = clip.T_a_b(0, index)
         errors.append(float((result.T_world_cam[:3, 3] / unit - T_true[:3, 3]).norm()))
     return errors
+
+
+def test_a_keyframe_of_nonsense_does_not_end_a_run(
+        tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    render('room', tmp_path / 'room', frames=slice(0, 60, 3), size=SIZE)
+    sequence = load_sequence(tmp_path / 'room')
+
+    class Nonsense(FrontendPipeline):
+        def process(self, *args: Any) -> FrameResult:
+            result = super().process(*args)
+            return replace(result, events=tuple(
+                replace(e, T_world_kf=e.T_world_kf * np.nan) if e.keyframe_id == 1 else e
+                for e in result.events))
+
+    config = Config().with_values({'camera.width': '280'})
+    run = offline.run(sequence, config, range(len(sequence)), make_frontend=Nonsense)
+    assert len(run.results) == len(sequence) and len(run.keyframes) > 1
+    assert any('keyframe 1 is not used' in message for message in caplog.messages)
 
 
 def test_both_baselines_follow_a_model_that_is_right(clip: Clip) -> None:
