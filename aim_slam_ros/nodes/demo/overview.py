@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Mapping
 
 from msg_adapters import frames
+from msg_adapters.keyframes import keyframe_placement
 
 from .collector import Heard, Topic
 
@@ -31,14 +32,20 @@ NOTHING = Overview('no answer yet', 0, 0, 0)
 
 
 def overview(topics: Mapping[str, Topic]) -> Overview:
-    """Everything until now; reads two messages."""
+    """Everything until now; reads three messages."""
     row = topics['frame'].read_newest()
     if row is None:
         return NOTHING
     report = frames.frame_report(row)
-    return Overview(report.result.status.value, topics['keyframe'].messages,
+    return Overview(report.result.status.value, _keyframes(topics['keyframe']),
                     int(newest_status(topics, LOOP_CLOSURE).values.get('loops', 0)),
                     report.dropped)
+
+
+def _keyframes(topic: Topic) -> int:
+    """Ids count from 0, and of those told together the new one is the last."""
+    table = topic.read_newest()
+    return 0 if table is None else keyframe_placement(table).poses[0].keyframe_id + 1
 
 
 @dataclass(frozen=True)
