@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from .fusion import FeatureFusion, resized
 from .layers import LayerNorm
-from .products import PixelLinear
 from .place_encoding import place_encoding
+from .products import PixelLinear
 from .sizes import PATCH_PX, VggtSizes
 
 _HIDDEN = 32      # channels before the last layer
