@@ -19,10 +19,7 @@ from .landmarks import LandmarkCache
 _SEARCH_PX = 90.0      # how far a point may be from a prediction by motion alone
 _SEARCH_POINTS = 80    # strongest corners of a reference that are searched that far
 _SEARCH_MIN = 20       # found points below which the search says nothing
-_TIGHT_PX = 12.0       # and from the prediction by a pose that is nearly right
-# Of the points predicted in the image explained: the motion was as expected. With .3, or by where
-# the points were found instead, a wrong pose passes after a jump.
-_CONVINCING = 0.6
+_TIGHT_PX = 12.0       # and from the prediction by the pose that they gave
 
 
 @dataclass(frozen=True)
@@ -49,12 +46,8 @@ class Followed:
 
 @dataclass(frozen=True)
 class _Found:
-    """Points of all references found in the image, one row each.
+    """Points of all references found in the image, one row each."""
 
-    searched: how many were predicted there.
-    """
-
-    searched: int
     owner: np.ndarray
     points_world: np.ndarray
     spread_world: np.ndarray
@@ -71,17 +64,14 @@ class Follower:
     def follow(self, grey: np.ndarray, K: Tensor, T_world_cam_guess: Tensor,
                references: Sequence[Keyframe]) -> Followed:
         """references: the one that counts for matched_fraction first. K: [3,3] of the image."""
-        found = self._find(grey, K, T_world_cam_guess, references, wide=False)
-        solution = self._solve(found, K, T_world_cam_guess, self._config.min_inliers)
-        if solution is None or solution.inliers.sum() < _CONVINCING * found.searched:
-            T_world_cam = self._searched(grey, K, T_world_cam_guess, references)
-            found = self._find(grey, K, T_world_cam, references, wide=False)
-            solution = self._solve(found, K, T_world_cam, self._config.min_inliers)
+        T_world_cam = self._searched(grey, K, T_world_cam_guess, references)
+        found = self._find(grey, K, T_world_cam, references, wide=False)
+        solution = self._solve(found, K, T_world_cam, self._config.min_inliers)
         return self._followed(found, solution, T_world_cam_guess, references)
 
     def _searched(self, grey: np.ndarray, K: Tensor, T_world_cam: Tensor,
                   references: Sequence[Keyframe]) -> Tensor:
-        """Roughly where the camera is after a motion that nobody expected."""
+        """Roughly where the camera is. Left out where a pose seems right without, a wrong one passes."""
         found = self._find(grey, K, T_world_cam, references, wide=True)
         solution = self._solve(found, K, T_world_cam, _SEARCH_MIN)
         return T_world_cam if solution is None else sim3.inverse(solution.T_cam_ref)
@@ -89,7 +79,6 @@ class Follower:
     def _find(self, grey: np.ndarray, K: Tensor, T_world_cam: Tensor,
               references: Sequence[Keyframe], wide: bool) -> _Found:
         """Wide: a few points, far around; else all of them, near their predictions."""
-        searched = 0
         owners, points, spreads, pixels = [], [], [], []
         T_cam_world = sim3.inverse(T_world_cam)
         for index, keyframe in enumerate(references):
@@ -104,14 +93,13 @@ class Follower:
             matches = refine(keyframe.frame.grey, grey, landmarks.uv, uv,
                              _SEARCH_PX if wide else _TIGHT_PX, None if wide else 0.7,
                              LEVELS if wide else TIGHT_LEVELS)
-            searched += matches.searched
             hit = matches.valid
             owners.append(np.full(int(hit.sum()), index))
             points.append(world[hit])
             spreads.append((world[hit] - T[:3, 3]) * sigma[hit, None])
             pixels.append(matches.uv_b[hit])
-        return _Found(searched, np.concatenate(owners), np.concatenate(points),
-                      np.concatenate(spreads), np.concatenate(pixels))
+        return _Found(np.concatenate(owners), np.concatenate(points), np.concatenate(spreads),
+                      np.concatenate(pixels))
 
     def _solve(self, found: _Found, K: Tensor, T_world_cam: Tensor,
                at_least: int) -> RigidSolution | None:

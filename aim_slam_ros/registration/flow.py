@@ -20,14 +20,10 @@ _ROUGHLY = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 8, 0.05)   # the wa
 
 @dataclass(frozen=True)
 class FlowMatches:
-    """uv_b: [N,2] float32, where each point was found. valid: [N] bool.
-
-    searched: how many were predicted inside the image.
-    """
+    """uv_b: [N,2] float32, where each point was found. valid: [N] bool."""
 
     uv_b: np.ndarray
     valid: np.ndarray
-    searched: int
 
 
 def _flow(a: np.ndarray, b: np.ndarray, uv_a: np.ndarray, uv_b: np.ndarray,
@@ -52,7 +48,7 @@ def refine(a: np.ndarray, b: np.ndarray, uv_a: np.ndarray, uv_b_predicted: np.nd
     valid = _inside(uv_b, b)
     rows = np.flatnonzero(valid)
     if rows.size == 0:
-        return FlowMatches(uv_b, valid, 0)
+        return FlowMatches(uv_b, valid)
     start = np.ascontiguousarray(uv_a[rows], np.float32)
     found, ok = _flow(a, b, start, uv_b[rows], levels, _CRITERIA)
     ok &= np.linalg.norm(found - uv_b[rows], axis=1) <= max_move_px
@@ -62,7 +58,7 @@ def refine(a: np.ndarray, b: np.ndarray, uv_a: np.ndarray, uv_b_predicted: np.nd
         ok[ok] = back_ok & (np.linalg.norm(back - start[ok], axis=1) <= max_round_trip_px)
     valid[rows] = ok
     uv_b[rows] = found
-    return FlowMatches(uv_b, valid, len(rows))
+    return FlowMatches(uv_b, valid)
 
 
 def _inside(uv: np.ndarray, image: np.ndarray) -> np.ndarray:
