@@ -71,7 +71,7 @@ class Follower:
 
     def _searched(self, grey: np.ndarray, K: Tensor, T_world_cam: Tensor,
                   references: Sequence[Keyframe]) -> Tensor:
-        """Roughly where the camera is. Left out where a pose seems right without, a wrong one passes."""
+        """Roughly where the camera is; without it a wrong pose may pass for a right one."""
         found = self._find(grey, K, T_world_cam, references, wide=True)
         solution = self._solve(found, K, T_world_cam, _SEARCH_MIN)
         return T_world_cam if solution is None else sim3.inverse(solution.T_cam_ref)
