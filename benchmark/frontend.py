@@ -31,7 +31,7 @@ from aim_slam_ros.frontend.following import Follower
 from aim_slam_ros.frontend.image_tracking import ImageTracker
 from aim_slam_ros.frontend.joint_tracking import JointTracker
 from aim_slam_ros.frontend.keyframe_map import KeyframeMap
-from aim_slam_ros.frontend.landmarks import LandmarkCache
+from aim_slam_ros.frontend.landmarks import followed_corners, matched_grid
 from aim_slam_ros.frontend.matching import predict_matches
 from aim_slam_ros.frontend.pipeline import FrontendPipeline
 from aim_slam_ros.frontend.sigma import rerank
@@ -197,7 +197,7 @@ def _stages(inputs: Inputs) -> Figures:
     frame = _frame(inputs, (len(inputs.images) - 1) // STEPS * (STEPS - 1) + 2)
     T_world_cam = inputs.model.T_world_cam[frame.stamp_ns]
     last, *others = keyframes.piece[::-1]
-    follower = Follower(config.following, LandmarkCache(config.following))
+    follower = Follower(config.following, followed_corners(config.following))
     figures: Figures = {
         'following_ms': _median_ms(lambda: follower.follow(
             frame.grey, inputs.model.K, T_world_cam, [last, *others[:2]])),
@@ -215,15 +215,15 @@ def _tracking(inputs: Inputs, frame: Frame, keyframes: tuple[Keyframe, ...],
     T_world_cam = inputs.model.T_world_cam[frame.stamp_ns]
     prediction = inputs.model.infer([inputs.model.encode(frame), *(k.encoding for k in keyframes)])
     window = TrackingWindow(frame, prediction, keyframes, T_world_cam)
-    found = predict_matches(keyframes, frame.grey, K, T_world_cam, config.tracking.stride,
-                            config.following.sigma_depth)
+    landmarks, sigma_depth = matched_grid(config.tracking.stride), config.following.sigma_depth
+    found = predict_matches(keyframes, landmarks, frame.grey, K, T_world_cam, sigma_depth)
     by_images = ImageTracker(config.tracking, config.following, config.keyframes.min_confident)
     by_rays = JointTracker(config.joint_tracking)
     figures: Figures = {
         'pose_mean': _median_ms(lambda: pose_mean(window, 0.05)),
+        'choosing': _median_ms(lambda: matched_grid(config.tracking.stride).of(keyframes[0])),
         'matching': _median_ms(lambda: predict_matches(
-            keyframes, frame.grey, K, T_world_cam, config.tracking.stride,
-            config.following.sigma_depth)),
+            keyframes, landmarks, frame.grey, K, T_world_cam, sigma_depth)),
         'solve': _median_ms(lambda: solve_rigid(
             found.points_world, found.uv, K, sim3.inverse(T_world_cam), found.spread_world,
             config.tracking.sigma_px)),

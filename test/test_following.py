@@ -14,9 +14,9 @@ from torch import Tensor
 
 from aim_slam_ros.config import FollowingConfig
 from aim_slam_ros.frontend.following import Followed, Follower
-from aim_slam_ros.frontend.landmarks import LandmarkCache, relative_depth_sigma
+from aim_slam_ros.frontend.landmarks import followed_corners
 from aim_slam_ros.geometry import sim3
-from aim_slam_ros.types import GUESSED_CONFIDENCE, Keyframe
+from aim_slam_ros.types import Keyframe
 
 CONFIG = FollowingConfig()
 
@@ -25,8 +25,8 @@ def _follow(clip: Clip, references: list[Keyframe], index: int, T_guess: Tensor,
             config: FollowingConfig = CONFIG) -> Followed:
     frame = clip.frame(index)
     assert frame.K is not None
-    return Follower(config, LandmarkCache(config)).follow(frame.grey, frame.K, T_guess,
-                                                          references)
+    return Follower(config, followed_corners(config)).follow(
+        frame.grey, frame.K, T_guess, references)
 
 
 def _error(T: Tensor, truth: Tensor) -> tuple[float, float]:
@@ -85,8 +85,8 @@ def test_another_place_is_no_pose(clip: Clip) -> None:
     frame = clip.frame(10)
     grey = clips.noise(3, (frame.width, frame.height))[..., 0].copy()
     assert frame.K is not None
-    got = Follower(CONFIG, LandmarkCache(CONFIG)).follow(grey, frame.K, clip.T_world_cam[10],
-                                                         [keyframe])
+    got = Follower(CONFIG, followed_corners(CONFIG)).follow(
+        grey, frame.K, clip.T_world_cam[10], [keyframe])
     assert not got.ok and 'points' in got.reason
     assert bool(torch.isfinite(got.T_world_cam).all()) and got.T_world_cam.shape == (4, 4)
 
@@ -117,6 +117,25 @@ def test_half_of_a_wrong_map_is_outvoted(clip: Clip) -> None:
     assert not got.ok or min(got.fractions.values()) < 0.5 * max(got.fractions.values())
 
 
+def test_what_drift_has_put_elsewhere_does_not_outvote_the_reference(clip: Clip) -> None:
+    """Two old keyframes, a long way round behind the reference, 40 cm beside it: of one mind, but
+    the image is followed from the reference."""
+    keyframes = clips.true_map(clip, [4, 11, 13])
+    drift = torch.tensor([0.4, 0.0, 0.0], dtype=torch.float64)
+    drifted = []
+    for keyframe in keyframes.piece[1:]:
+        T_world_kf = keyframe.T_world_kf.clone()
+        T_world_kf[:3, 3] += drift
+        drifted.append(replace(keyframe, T_world_kf=T_world_kf))
+    T_drifted = clip.T_world_cam[12].clone()
+    T_drifted[:3, 3] += drift
+    got = _follow(clip, [keyframes[0], *drifted], 12, T_drifted)
+    # 4 cm: half of what the reference saw has left the image
+    assert got.ok and _error(got.T_world_cam, clip.T_world_cam[12])[1] < 0.06
+    without = _follow(clip, drifted, 12, T_drifted)
+    assert without.ok and _error(without.T_world_cam, T_drifted)[1] < 0.03
+
+
 def test_ten_per_cent_of_depth_noise_in_a_far_away_world(clip: Clip) -> None:
     """It is along the keyframe's rays, wherever the world's origin is."""
     keyframe = clips.true_map(clip, [10])[0]
@@ -132,35 +151,3 @@ def test_ten_per_cent_of_depth_noise_in_a_far_away_world(clip: Clip) -> None:
     assert got.ok and got.matched_fraction > 0.6
     # noisy depths pull the camera towards the keyframe: 3 cm of the 17 cm between them
     assert rotation < 0.8 and position < 0.045
-
-
-def test_landmarks_are_corners_of_what_was_seen(clip: Clip) -> None:
-    keyframe = clips.true_map(clip, [10])[0]
-    confidence = keyframe.confidence.clone()
-    confidence[:, :45] = 1.001     # 14 per cent; the worst fifth is left out
-    landmarks = LandmarkCache(CONFIG).of(replace(keyframe, confidence=confidence))
-    assert 50 < len(landmarks.uv) <= CONFIG.points
-    assert (landmarks.uv[:, 0] > 42).all() and landmarks.uv[:, 0].min() < 70
-    assert len(landmarks.strongest(7).uv) == 7
-    points = landmarks.points(keyframe)
-    at = np.rint(landmarks.uv).astype(int)
-    assert np.allclose(points[:, 2], keyframe.points_cam[at[:, 1], at[:, 0], 2].numpy())
-
-
-def test_landmarks_stay_the_same_while_the_keyframe_learns(clip: Clip) -> None:
-    keyframe, cache = clips.true_map(clip, [10])[0], LandmarkCache(CONFIG)
-    first = cache.of(keyframe)
-    grown = replace(keyframe, points_cam=keyframe.points_cam * 2, observations=2)
-    assert cache.of(grown) is first
-    assert np.allclose(first.points(grown), 2 * first.points(keyframe))
-
-
-def test_sigma_of_a_depth_follows_its_confidence() -> None:
-    confidence = torch.tensor([1.0, GUESSED_CONFIDENCE - 0.01, 2.0, 5.0, 500.0])
-    sigma = relative_depth_sigma(confidence, 5.0, 0.03)
-    assert float(sigma[3]) == pytest.approx(0.03)
-    assert float(sigma[0]) == float(sigma[1]) == 0.5 > float(sigma[2]) > float(sigma[3])
-    assert float(sigma[4]) >= 0.3 * 0.03, 'never sure beyond reason'
-    # fused four times: the same ratios, the same sigmas
-    assert torch.allclose(relative_depth_sigma(1 + 4 * (confidence[2:] - 1), 17.0, 0.03),
-                          sigma[2:])

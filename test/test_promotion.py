@@ -15,7 +15,7 @@ from aim_slam_ros.config import FollowingConfig, KeyframesConfig
 from aim_slam_ros.frontend.following import Followed, Follower
 from aim_slam_ros.frontend.initialisation import Beginning
 from aim_slam_ros.frontend.keyframe_map import KeyframeMap
-from aim_slam_ros.frontend.landmarks import LandmarkCache
+from aim_slam_ros.frontend.landmarks import followed_corners
 from aim_slam_ros.frontend.promotion import Promotion
 from aim_slam_ros.frontend.tracking import TrackingResult
 from aim_slam_ros.frontend.window import WindowEstimate
@@ -47,7 +47,7 @@ def _followed(clip: Clip, keyframes: KeyframeMap, index: int) -> Followed:
     frame = clip.frame(index)
     assert frame.K is not None
     config = FollowingConfig()
-    return Follower(config, LandmarkCache(config)).follow(
+    return Follower(config, followed_corners(config)).follow(
         frame.grey, frame.K, clip.T_world_cam[index], keyframes.piece)
 
 

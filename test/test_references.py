@@ -8,7 +8,7 @@ import torch
 from clip import Clip
 
 from aim_slam_ros.frontend.following import Followed, Follower
-from aim_slam_ros.frontend.landmarks import LandmarkCache
+from aim_slam_ros.frontend.landmarks import followed_corners
 from aim_slam_ros.frontend.references import References
 from aim_slam_ros.types import Frame
 
@@ -16,7 +16,7 @@ from aim_slam_ros.types import Frame
 def _references(clip: Clip, indices: list[int], main: int, units: tuple[float, ...] = (),
                 **values: object) -> tuple[References, Follower]:
     config = clips.config(**values)
-    follower = Follower(config.following, LandmarkCache(config.following))
+    follower = Follower(config.following, followed_corners(config.following))
     references = References(config, clips.true_map(clip, indices, units), follower)
     references.main_id = main
     return references, follower

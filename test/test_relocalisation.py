@@ -13,7 +13,7 @@ from aim_slam_ros.config import Config
 from aim_slam_ros.frontend.following import Follower
 from aim_slam_ros.frontend.image_tracking import ImageTracker
 from aim_slam_ros.frontend.keyframe_map import KeyframeMap
-from aim_slam_ros.frontend.landmarks import LandmarkCache
+from aim_slam_ros.frontend.landmarks import followed_corners
 from aim_slam_ros.frontend.relocalisation import Relocalisation
 from aim_slam_ros.frontend.stages import Stopwatch
 from aim_slam_ros.frontend.window import WindowTracker
@@ -31,7 +31,7 @@ def _parts(clip: Clip, config: Config) -> tuple[KeyframeMap, Relocalisation, Win
         made = clips.add_keyframe(clips.true_map(clip, []), clip, index)
         keyframes.add(model.encode(made.frame), made.K, made.points_cam, made.confidence,
                       made.T_world_kf)
-    follower = Follower(config.following, LandmarkCache(config.following))
+    follower = Follower(config.following, followed_corners(config.following))
     window = WindowTracker(config, model, ImageTracker(
         config.tracking, config.following, config.keyframes.min_confident))
     return keyframes, Relocalisation(config, keyframes, follower, window), window

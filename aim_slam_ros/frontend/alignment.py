@@ -13,7 +13,7 @@ from ..registration.scale import ScaleEstimate, log_depth_ratio
 from ..types import GUESSED_CONFIDENCE, Keyframe, WindowPrediction
 from .tracking import TrackingWindow
 
-_GRID = 8   # every eighth pixel, both ways: medians need no more
+_GRID = 16  # every so many pixels, both ways: medians need no more
 
 
 def unit_of(keyframe: Keyframe, prediction: WindowPrediction, view: int) -> ScaleEstimate:

@@ -19,7 +19,10 @@ from .landmarks import LandmarkCache
 _SEARCH_PX = 90.0      # how far a point may be from a prediction by motion alone
 _SEARCH_POINTS = 80    # strongest corners of a reference that are searched that far
 _SEARCH_MIN = 20       # found points below which the search says nothing
-_TIGHT_PX = 12.0       # and from the prediction by the pose that they gave
+_TIGHT_PX = 12.0       # and from the prediction by a pose that is nearly right
+# Of the first reference's points in the image explained: the motion was as expected.
+_CONVINCING = 0.6
+_OUTVOTED = 0.3        # a smaller share of the first reference: the others may contradict it
 
 
 @dataclass(frozen=True)
@@ -46,12 +49,20 @@ class Followed:
 
 @dataclass(frozen=True)
 class _Found:
-    """Points of all references found in the image, one row each."""
+    """Points of all references found in the image, one row each.
 
+    searched: how many of the first reference's were predicted there.
+    """
+
+    searched: int
     owner: np.ndarray
     points_world: np.ndarray
     spread_world: np.ndarray
     uv: np.ndarray
+
+    def share_of_first(self, solution: RigidSolution) -> float:
+        """How much of the first reference that should be in the image the pose explains."""
+        return int((self.owner[solution.inliers] == 0).sum()) / max(1, self.searched)
 
 
 class Follower:
@@ -63,15 +74,31 @@ class Follower:
 
     def follow(self, grey: np.ndarray, K: Tensor, T_world_cam_guess: Tensor,
                references: Sequence[Keyframe]) -> Followed:
-        """references: the one that counts for matched_fraction first. K: [3,3] of the image."""
-        T_world_cam = self._searched(grey, K, T_world_cam_guess, references)
-        found = self._find(grey, K, T_world_cam, references, wide=False)
-        solution = self._solve(found, K, T_world_cam, self._config.min_inliers)
+        """references: the one that counts for matched_fraction first. K: [3,3] of the image.
+
+        Where the pose hardly explains that one, it alone: before a loop is closed the others may
+        be where the camera passed long ago, and the drift since then stands between them.
+        """
+        followed = self._against(references, grey, K, T_world_cam_guess)
+        if len(references) == 1 or followed.matched_fraction >= _OUTVOTED:
+            return followed
+        alone = self._against(references[:1], grey, K, T_world_cam_guess)
+        return alone if alone.ok and alone.matched_fraction > followed.matched_fraction \
+            else followed
+
+    def _against(self, references: Sequence[Keyframe], grey: np.ndarray, K: Tensor,
+                 T_world_cam_guess: Tensor) -> Followed:
+        found = self._find(grey, K, T_world_cam_guess, references, wide=False)
+        solution = self._solve(found, K, T_world_cam_guess, self._config.min_inliers)
+        if solution is None or found.share_of_first(solution) < _CONVINCING:
+            T_world_cam = self._searched(grey, K, T_world_cam_guess, references)
+            found = self._find(grey, K, T_world_cam, references, wide=False)
+            solution = self._solve(found, K, T_world_cam, self._config.min_inliers)
         return self._followed(found, solution, T_world_cam_guess, references)
 
     def _searched(self, grey: np.ndarray, K: Tensor, T_world_cam: Tensor,
                   references: Sequence[Keyframe]) -> Tensor:
-        """Roughly where the camera is; without it a wrong pose may pass for a right one."""
+        """Roughly where the camera is after a motion that nobody expected."""
         found = self._find(grey, K, T_world_cam, references, wide=True)
         solution = self._solve(found, K, T_world_cam, _SEARCH_MIN)
         return T_world_cam if solution is None else sim3.inverse(solution.T_cam_ref)
@@ -79,6 +106,7 @@ class Follower:
     def _find(self, grey: np.ndarray, K: Tensor, T_world_cam: Tensor,
               references: Sequence[Keyframe], wide: bool) -> _Found:
         """Wide: a few points, far around; else all of them, near their predictions."""
+        searched = 0
         owners, points, spreads, pixels = [], [], [], []
         T_cam_world = sim3.inverse(T_world_cam)
         for index, keyframe in enumerate(references):
@@ -93,13 +121,14 @@ class Follower:
             matches = refine(keyframe.frame.grey, grey, landmarks.uv, uv,
                              _SEARCH_PX if wide else _TIGHT_PX, None if wide else 0.7,
                              LEVELS if wide else TIGHT_LEVELS)
+            searched = searched if index else matches.searched
             hit = matches.valid
             owners.append(np.full(int(hit.sum()), index))
             points.append(world[hit])
             spreads.append((world[hit] - T[:3, 3]) * sigma[hit, None])
             pixels.append(matches.uv_b[hit])
-        return _Found(np.concatenate(owners), np.concatenate(points), np.concatenate(spreads),
-                      np.concatenate(pixels))
+        return _Found(searched, np.concatenate(owners), np.concatenate(points),
+                      np.concatenate(spreads), np.concatenate(pixels))
 
     def _solve(self, found: _Found, K: Tensor, T_world_cam: Tensor,
                at_least: int) -> RigidSolution | None:

@@ -18,6 +18,7 @@ from ..geometry import camera, sim3
 from ..registration.rigid import RigidSolution, solve_rigid
 from ..registration.scale import log_depth_ratio
 from .alignment import pose_mean
+from .landmarks import matched_grid
 from .matching import PredictedMatches, predict_matches
 from .tracking import TrackingResult, TrackingWindow
 
@@ -30,6 +31,7 @@ class ImageTracker:
         self._config = config
         self._following = following
         self._min_seen = min_seen
+        self._landmarks = matched_grid(config.stride)
 
     def track(self, window: TrackingWindow) -> TrackingResult:
         """Keyframes stay where they are. Fails where neither model nor images place the frame."""
@@ -53,10 +55,8 @@ class ImageTracker:
     def _refined(self, window: TrackingWindow,
                  T_world_cam: Tensor) -> tuple[PredictedMatches, RigidSolution | None]:
         K = window.prediction.K[0]
-        # As many in a small image: a solve needs their number, not their distance.
-        stride = max(1, round(self._config.stride * window.frame.width / 518.0))
-        matches = predict_matches(window.keyframes, window.frame.grey, K, T_world_cam, stride,
-                                  self._following.sigma_depth)
+        matches = predict_matches(window.keyframes, self._landmarks, window.frame.grey, K,
+                                  T_world_cam, self._following.sigma_depth)
         if len(matches.uv) < self._config.min_matches:
             return matches, None
         return matches, solve_rigid(matches.points_world, matches.uv, K,

@@ -15,7 +15,7 @@ from ..types import Frame, FrameEncoding
 from .following import Followed, Follower
 from .initialisation import Inferred, Initialisation
 from .keyframe_map import KeyframeMap
-from .landmarks import LandmarkCache
+from .landmarks import followed_corners
 from .relocalisation import Relocalisation
 from .stages import Stopwatch
 from .window import WindowEstimate, WindowTracker
@@ -70,7 +70,7 @@ class Inquirer:
         self._map = keyframes
         self._window = window
         # A follower of its own: the other one may be at work on the next image.
-        follower = Follower(config.following, LandmarkCache(config.following))
+        follower = Follower(config.following, followed_corners(config.following))
         self._relocalisation = Relocalisation(config, keyframes, follower, window)
 
     def run(self, inquiry: Inquiry) -> Findings:

@@ -21,7 +21,7 @@ from .initialisation import Beginning, Initialisation
 from .inquiry import BeginningInquiry, Findings, Inquirer, Inquiry, TrackingInquiry
 from .joint_tracking import JointTracker
 from .keyframe_map import KeyframeMap
-from .landmarks import LandmarkCache
+from .landmarks import followed_corners
 from .motion import ConstantVelocity
 from .promotion import Promotion
 from .references import References
@@ -55,7 +55,7 @@ class FrontendPipeline:
         self._config = config
         self._map = KeyframeMap(config.sigma)
         self._admission = Admission(config.camera)
-        self._follower = Follower(config.following, LandmarkCache(config.following))
+        self._follower = Follower(config.following, followed_corners(config.following))
         self._references = References(config, self._map, self._follower)
         self._window = WindowTracker(config, model, _tracker(config))
         self._inquirer = Inquirer(config, self._map, self._window)
