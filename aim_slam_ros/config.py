@@ -192,7 +192,8 @@ class TrackingConfig(Section):
         'image', "refine matches in the images, or the paper's joint Sim(3) solve",
         choices=('image', 'paper'))
     stride: int = setting(
-        24, 'every so many pixels of a keyframe are matched [px at a width of 518]', 1, 64)
+        24, 'side of the squares of a keyframe of each of which a point is matched [px at a width '
+        'of 518]', 1, 64)
     sigma_px: float = setting(
         1.0, 'standard deviation of a refined match [px]', 0.05, 10)
     sigma_model_px: float = setting(
