@@ -68,7 +68,7 @@ lint: $(READY)
 
 benchmark: OUT ?= out/benchmark
 benchmark: $(READY)
-	@for part in offline ros; do $(BIN)/python benchmark/$$part.py \
+	@for part in offline ros truth; do $(BIN)/python benchmark/$$part.py \
 	--data $(call quoted,$(DATA)) --out $(call quoted,$(OUT)) || exit 1; done
 	@for part in frontend memory vggt; do $(BIN)/python benchmark/$$part.py \
 	--out $(call quoted,$(OUT)) || exit 1; done
