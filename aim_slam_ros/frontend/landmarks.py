@@ -96,8 +96,8 @@ def matched_grid(stride_px: int) -> LandmarkCache:
     """One point in each square of that side (px at a width of 518): all over the keyframe.
 
     The pixel with the most texture there that is neither at a depth edge nor of the least
-    confident: where neither the image can be matched nor the depth be right, a point only adds
-    noise (measured: a regular grid has two to three times the error in the rendered corridor).
+    confident: where the image cannot be matched or the depth not be right, a point only adds noise
+    (measured: a regular grid has twice the error in the rendered corridor).
     """
     return LandmarkCache(partial(_best_of_squares, stride_px))
 
