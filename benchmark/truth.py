@@ -27,7 +27,7 @@ from aim_slam_ros.frontend.matching import predict_matches
 from aim_slam_ros.geometry import camera, sim3
 from aim_slam_ros.models.simulated.levels import PRESETS
 from aim_slam_ros.models.simulated.model import SimulatedModel
-from aim_slam_ros.recorded_truth import RecordedTruth
+from aim_slam_ros.recorded_truth import RecordedTruth, pose_at
 from aim_slam_ros.registration.rigid import solve_rigid
 from aim_slam_ros.types import Frame, FrameEncoding, Keyframe
 
@@ -60,7 +60,7 @@ def _agreement(name: str, sequence: Sequence, step: int) -> Figures:
     for i in truth.with_depth(range(0, len(sequence), step)):
         frame = admission.admit(int(sequence.stamps_ns[i]), sequence.image(i), None)
         if isinstance(frame, Frame):
-            views.append(_view(len(views), model, truth, model.encode(frame)))
+            views.append(_view(len(views), model, model.encode(frame), sequence))
     pairs = [pair for a, b in zip(views, views[APART:])
              if (pair := _pair(a, b, landmarks, config)) is not None]
     at_truth, at_best, moved = np.array(pairs).T
@@ -70,15 +70,16 @@ def _agreement(name: str, sequence: Sequence, step: int) -> Figures:
             f'{name}_pairs': float(len(pairs))}
 
 
-def _view(keyframe_id: int, model: SimulatedModel, truth: RecordedTruth,
-          encoding: FrameEncoding) -> Keyframe:
+def _view(keyframe_id: int, model: SimulatedModel, encoding: FrameEncoding,
+          sequence: Sequence) -> Keyframe:
     """The image with its true depth at its true pose, in metres."""
     seen = model.infer([encoding])
-    true_view = truth.at(encoding.frame.stamp_ns)
-    assert true_view is not None
+    assert sequence.groundtruth is not None
+    T_world_cam = pose_at(sequence.groundtruth, encoding.frame.stamp_ns)
+    assert T_world_cam is not None
     points = camera.unproject(seen.depth[0], seen.K[0])
     return Keyframe(keyframe_id, 0, encoding, seen.K[0], points, seen.confidence[0],
-                    true_view.T_world_cam)
+                    T_world_cam)
 
 
 def _pair(old: Keyframe, new: Keyframe, landmarks: LandmarkCache,
