@@ -10,8 +10,6 @@ DATA ?= data
 SOURCES := $(shell find aim_slam_ros msg_adapters config launch resource -name __pycache__ -prune \
 	-o -print) package.xml setup.cfg setup.py
 
-# Idle OpenMP threads that spin cost other processes several times their own work.
-export OMP_WAIT_POLICY := PASSIVE
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Nothing started here talks to other machines, and the wheels know one middleware.
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST

@@ -17,6 +17,7 @@ import time
 from dataclasses import dataclass
 from typing import Callable, Sequence
 
+import aim_slam_ros  # noqa: F401: before torch, to which it says how its threads wait
 import cv2
 import numpy as np
 import torch

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 from typing import Sequence
 
 import clip as clips
@@ -67,3 +71,15 @@ def test_a_device_that_is_not_there_is_refused_at_the_start(clip: Clip) -> None:
         FrontendPipeline(config, TrueModel(clip))
     with pytest.raises(ConfigError, match="keyframes.device: 'gpu' is not allowed"):
         chosen_device('keyframes.device', 'gpu')
+
+
+@pytest.mark.parametrize('said, spins', [({}, '10000'), ({'GOMP_SPINCOUNT': '7'}, '7'),
+                                         ({'OMP_WAIT_POLICY': 'PASSIVE'}, 'None')])
+def test_idle_threads_wait_shortly_unless_the_user_says_otherwise(said: dict[str, str],
+                                                                  spins: str) -> None:
+    known = {k: v for k, v in os.environ.items() if k not in ('GOMP_SPINCOUNT', 'OMP_WAIT_POLICY')}
+    script = ("import sys, os, aim_slam_ros; assert 'torch' not in sys.modules; "
+              "print(os.environ.get('GOMP_SPINCOUNT'))")
+    printed = subprocess.run([sys.executable, '-c', script], env=known | said, check=True,
+                             capture_output=True, text=True).stdout
+    assert printed.strip() == spins

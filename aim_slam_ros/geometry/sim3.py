@@ -7,7 +7,9 @@ Tangent order is (translation, rotation, log-scale); perturbations act on the le
 from __future__ import annotations
 
 import math
+from typing import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,13 +23,12 @@ def identity() -> Tensor:
 
 def from_parts(scale: Tensor | float, rotation: Tensor, translation: Tensor) -> Tensor:
     """Scale [...], rotation [...,3,3] and translation [...,3] to [...,4,4] float64."""
-    rotation = rotation.to(torch.float64)
-    s = torch.as_tensor(scale, dtype=torch.float64)
-    T = torch.zeros(*rotation.shape[:-2], 4, 4, dtype=torch.float64)
-    T[..., :3, :3] = s[..., None, None] * rotation
-    T[..., :3, 3] = translation.to(torch.float64)
+    R, s = rotation.numpy(), np.asarray(scale, np.float64)
+    T = np.zeros((*R.shape[:-2], 4, 4))
+    T[..., :3, :3] = s[..., None, None] * R
+    T[..., :3, 3] = translation.numpy()
     T[..., 3, 3] = 1.0
-    return T
+    return torch.from_numpy(T)
 
 
 def scale_of(T: Tensor) -> Tensor:
@@ -58,8 +59,8 @@ def with_scale(T: Tensor, scale: Tensor | float) -> Tensor:
 def on_group(T: Tensor) -> Tensor:
     """The member that a matrix [...,4,4] was before rounding moved it away a little.
 
-    ``inverse`` takes its argument for a member: in a chain of poses, each made of the inverse of
-    the one before, what rounding adds grows exponentially.
+    Scale, rotation and adjoint take their argument for a member; in a chain of products, what
+    rounding adds stays.
     """
     R = rotation_from_quaternion(quaternion_of(rotation_of(T)))
     return from_parts(scale_of(T), R, translation_of(T))
@@ -67,13 +68,7 @@ def on_group(T: Tensor) -> Tensor:
 
 def inverse(T: Tensor) -> Tensor:
     """[...,4,4] to [...,4,4]."""
-    A = T[..., :3, :3]
-    A_inv = A.mT / (A.square().sum((-2, -1), keepdim=True) / 3.0)   # (s R)^-1 = (s R)^T / s^2
-    out = torch.zeros_like(T)
-    out[..., :3, :3] = A_inv
-    out[..., :3, 3] = -(A_inv @ T[..., :3, 3:])[..., 0]
-    out[..., 3, 3] = 1.0
-    return out
+    return torch.linalg.inv_ex(T).inverse   # unlike inv, without a look at what went wrong
 
 
 def transform(T: Tensor, points: Tensor) -> Tensor:
@@ -90,39 +85,62 @@ def hat(v: Tensor) -> Tensor:
 
 
 def exp(xi: Tensor) -> Tensor:
-    """Tangent [...,7] to Sim(3) [...,4,4], by the matrix exponential of its generator."""
-    generator = torch.zeros(*xi.shape[:-1], 4, 4, dtype=xi.dtype)
-    eye = torch.eye(3, dtype=xi.dtype)
-    generator[..., :3, :3] = hat(xi[..., 3:6]) + xi[..., 6, None, None] * eye
-    generator[..., :3, 3] = xi[..., :3]
-    return torch.linalg.matrix_exp(generator)
-
-
-def so3_log(R: Tensor) -> Tensor:
-    """Rotation [...,3,3] to its axis-angle vector [...,3], through the quaternion."""
-    q = quaternion_of(R)
-    sin_half = q[..., :3].norm(dim=-1, keepdim=True)
-    angle = 2.0 * torch.atan2(sin_half, q[..., 3:])
-    factor = torch.where(sin_half < _SMALL, torch.full_like(angle, 2.0),
-                         angle / sin_half.clamp_min(1e-300))
-    return factor * q[..., :3]
+    """Tangent [...,7] to Sim(3) [...,4,4]: the matrix exponential of its generator."""
+    tau, omega, sigma = np.split(xi.numpy(), [3, 6], -1)
+    T = np.zeros((*xi.shape[:-1], 4, 4))
+    T[..., :3, :3] = _of_generator(np.exp, omega, sigma)
+    T[..., :3, 3] = (_of_generator(_mean_exp, omega, sigma) @ tau[..., None])[..., 0]
+    T[..., 3, 3] = 1.0
+    return torch.from_numpy(T)
 
 
 def log(T: Tensor) -> Tensor:
-    """Sim(3) [...,4,4] to its tangent [...,7].
+    """Sim(3) [...,4,4] to its tangent [...,7], of the smallest rotation angle."""
+    M, scale = T.numpy(), scale_of(T).numpy()[..., None]
+    omega = _rotation_log(M[..., :3, :3] / scale[..., None])
+    sigma = np.log(scale)
+    inverse_mean = _of_generator(lambda z: 1.0 / _mean_exp(z), omega, sigma)
+    tau = (inverse_mean @ M[..., :3, 3:])[..., 0]
+    return torch.from_numpy(np.concatenate([tau, omega, sigma], -1))
 
-    The translation solves t = W tau with W = integral over u in [0, 1] of
-    exp(u (hat(omega) + sigma I)) du, read off one augmented matrix exponential.
+
+def _of_generator(f: Callable[[np.ndarray], np.ndarray], omega: np.ndarray,
+                  sigma: np.ndarray) -> np.ndarray:
+    """An analytic function f of the matrix hat(omega) + sigma I: [...,3,3].
+
+    omega [...,3], sigma [...,1]. The matrix has the eigenvalue sigma along the axis and
+    sigma +- i angle across it.
     """
-    sigma = torch.log(scale_of(T))
-    omega = so3_log(rotation_of(T))
-    A = hat(omega) + sigma[..., None, None] * torch.eye(3, dtype=T.dtype)
-    block = torch.zeros(*T.shape[:-2], 6, 6, dtype=T.dtype)
-    block[..., :3, :3] = A
-    block[..., :3, 3:] = torch.eye(3, dtype=T.dtype)
-    W = torch.linalg.matrix_exp(block)[..., :3, 3:]
-    tau = torch.linalg.solve(W, T[..., :3, 3:])[..., 0]
-    return torch.cat([tau, omega, sigma[..., None]], -1)
+    angle = np.linalg.norm(omega, axis=-1, keepdims=True)
+    axis = omega / np.maximum(angle, 1e-300)
+    across, along = f(sigma + 1j * angle), f(sigma + 0j).real
+    x, y, z = np.moveaxis(across.imag * axis, -1, 0)
+    M = ((along - across.real) * axis)[..., None] * axis[..., None, :]
+    M[..., 0, 0] += across.real[..., 0]
+    M[..., 1, 1] += across.real[..., 0]
+    M[..., 2, 2] += across.real[..., 0]
+    M[..., 0, 1] -= z
+    M[..., 0, 2] += y
+    M[..., 1, 0] += z
+    M[..., 1, 2] -= x
+    M[..., 2, 0] -= y
+    M[..., 2, 1] += x
+    return M
+
+
+def _mean_exp(z: np.ndarray) -> np.ndarray:
+    """The mean of exp(u z) over u in [0, 1]: how a motion of constant twist adds up its steps."""
+    return np.divide(np.expm1(z), z, out=np.ones_like(z), where=z != 0)
+
+
+def _rotation_log(R: np.ndarray) -> np.ndarray:
+    """Rotation [...,3,3] to its axis-angle vector [...,3], through the quaternion."""
+    q = _quaternion(R)
+    sin_half = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sin_half, q[..., 3:])
+    factor = np.where(sin_half < _SMALL, 2.0, angle / np.maximum(sin_half, 1e-300))
+    rotated: np.ndarray = factor * q[..., :3]
+    return rotated
 
 
 def adjoint(T: Tensor) -> Tensor:
@@ -139,19 +157,27 @@ def adjoint(T: Tensor) -> Tensor:
 
 def quaternion_of(R: Tensor) -> Tensor:
     """Rotation [...,3,3] to a unit quaternion [...,4], xyzw with w >= 0."""
-    m = R.reshape(*R.shape[:-2], 9).unbind(-1)
+    return torch.from_numpy(_quaternion(R.numpy()))
+
+
+def _quaternion(R: np.ndarray) -> np.ndarray:
+    m = np.moveaxis(R.reshape(*R.shape[:-2], 9), -1, 0)
     # Four equivalent forms (Shepperd); the one with the largest pivot is well conditioned.
-    pivots = torch.stack([m[0] - m[4] - m[8], m[4] - m[0] - m[8],
-                          m[8] - m[0] - m[4], m[0] + m[4] + m[8]], -1) + 1.0
-    forms = torch.stack([
-        torch.stack([pivots[..., 0], m[1] + m[3], m[2] + m[6], m[7] - m[5]], -1),
-        torch.stack([m[1] + m[3], pivots[..., 1], m[5] + m[7], m[2] - m[6]], -1),
-        torch.stack([m[2] + m[6], m[5] + m[7], pivots[..., 2], m[3] - m[1]], -1),
-        torch.stack([m[7] - m[5], m[2] - m[6], m[3] - m[1], pivots[..., 3]], -1)], -2)
-    best = pivots.argmax(-1)[..., None, None].expand(*pivots.shape[:-1], 1, 4)
-    q = forms.gather(-2, best)[..., 0, :]
-    q = q / q.norm(dim=-1, keepdim=True)
-    return torch.where(q[..., 3:] < 0, -q, q)
+    forms = np.zeros((*R.shape[:-2], 4, 4), R.dtype)
+    forms[..., 0, 0] = 1.0 + m[0] - m[4] - m[8]
+    forms[..., 1, 1] = 1.0 - m[0] + m[4] - m[8]
+    forms[..., 2, 2] = 1.0 - m[0] - m[4] + m[8]
+    forms[..., 3, 3] = 1.0 + m[0] + m[4] + m[8]
+    forms[..., 0, 1] = forms[..., 1, 0] = m[1] + m[3]
+    forms[..., 0, 2] = forms[..., 2, 0] = m[2] + m[6]
+    forms[..., 1, 2] = forms[..., 2, 1] = m[5] + m[7]
+    forms[..., 0, 3] = forms[..., 3, 0] = m[7] - m[5]
+    forms[..., 1, 3] = forms[..., 3, 1] = m[2] - m[6]
+    forms[..., 2, 3] = forms[..., 3, 2] = m[3] - m[1]
+    best = np.diagonal(forms, axis1=-2, axis2=-1).argmax(-1)[..., None, None]
+    q = np.take_along_axis(forms, best, -2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., 3:] < 0, -q, q)
 
 
 def rotation_from_quaternion(q: Tensor) -> Tensor:
