@@ -46,7 +46,7 @@ def model_image(image: np.ndarray, width: int) -> ModelImage:
     """
     height = max(1, round(image.shape[0] * width / image.shape[1] / _PATCH_PX)) * _PATCH_PX
     # copied by torch: images of messages are read-only, which it does not know
-    channels = torch.tensor(np.ascontiguousarray(image)).permute(2, 0, 1)[None]
+    channels = torch.tensor(np.ascontiguousarray(image))[None].permute(0, 3, 1, 2)
     resized = F.interpolate(channels, (height, width), mode='bicubic', antialias=True)
     top = max(0, height - width) // 2
     cut = resized[0, :, top:top + width].permute(1, 2, 0).numpy()

@@ -68,7 +68,7 @@ def on_group(T: Tensor) -> Tensor:
 
 def inverse(T: Tensor) -> Tensor:
     """[...,4,4] to [...,4,4]."""
-    return torch.linalg.inv_ex(T).inverse   # unlike inv, without a look at what went wrong
+    return torch.from_numpy(np.linalg.inv(T.numpy()))
 
 
 def transform(T: Tensor, points: Tensor) -> Tensor:
@@ -197,7 +197,7 @@ def mean(T: Tensor, weights: Tensor, iterations: int = 10) -> Tensor:
     for _ in range(iterations):
         step = (weights[:, None] * log(T @ inverse(centre))).sum(0)
         centre = exp(step) @ centre
-        if float(step.norm()) < 1e-10:
+        if float(step.norm()) < 1e-8:
             break
     return centre
 

@@ -99,29 +99,32 @@ def _linearise(T: np.ndarray, X: np.ndarray, uv: np.ndarray, K: np.ndarray,
     fx, fy = K[0, 0], K[1, 1]
     residual = np.stack([fx * a + K[0, 2], fy * b + K[1, 2]], 1) - uv
     residual[~front] = _FAR_PX
-    zero = np.zeros_like(a)
-    J_u = np.stack([fx / z, zero, -fx * a / z, -fx * a * b, fx * (1 + a * a), -fx * b])
-    J_v = np.stack([zero, fy / z, -fy * b / z, -fy * (1 + b * b), fy * a * b, fy * a])
-    squared = (residual ** 2).sum(1) / sigma_px ** 2
-    terms = [(J_u, residual[:, 0], 1.0), (J_v, residual[:, 1], 1.0)]
-    if spread is not None:
+    u, v = residual.T
+    # A row per parameter, the residual below them; a block per term: u, v, and what the depth
+    # errors take back.
+    rows = np.zeros((7, 3, len(X)))
+    rows[0, 0], rows[2, 0], rows[3, 0] = fx / z, -fx * a / z, -fx * a * b
+    rows[4, 0], rows[5, 0], rows[6, 0] = fx * (1 + a * a), -fx * b, u
+    rows[1, 1], rows[2, 1], rows[3, 1] = fy / z, -fy * b / z, -fy * (1 + b * b)
+    rows[4, 1], rows[5, 1], rows[6, 1] = fy * a * b, fy * a, v
+    squared = (u * u + v * v) / sigma_px ** 2
+    weight = np.ones((3, len(X)))
+    if spread is None:
+        weight[2] = 0.0
+    else:
         # Along e, the image of the depth error, the variance is sigma^2 + |e|^2: the information
         # is (I - e e^T / (sigma^2 + |e|^2)) / sigma^2.
         turned = spread @ T[:3, :3].T
-        e_u = J_u[0] * turned[:, 0] + J_u[2] * turned[:, 2]
-        e_v = J_v[1] * turned[:, 1] + J_v[2] * turned[:, 2]
-        shrink = 1.0 / (sigma_px ** 2 + e_u ** 2 + e_v ** 2)
-        along = e_u * residual[:, 0] + e_v * residual[:, 1]
-        squared = squared - shrink * along ** 2 / sigma_px ** 2
-        terms.append((e_u * J_u + e_v * J_v, along, -shrink))
-    robust = np.where(front, 1.0 / (1.0 + squared / _CAUCHY), 0.0) / sigma_px ** 2
-    H, g = np.zeros((6, 6)), np.zeros(6)
-    for J, r, factor in terms:
-        WJ = J * (robust * factor)
-        H += WJ @ J.T
-        g += WJ @ r
+        e_u = rows[0, 0] * turned[:, 0] + rows[2, 0] * turned[:, 2]
+        e_v = rows[1, 1] * turned[:, 1] + rows[2, 1] * turned[:, 2]
+        weight[2] = -1.0 / (sigma_px ** 2 + e_u * e_u + e_v * e_v)
+        rows[:, 2] = e_u * rows[:, 0] + e_v * rows[:, 1]
+        squared += weight[2] * rows[6, 2] ** 2 / sigma_px ** 2
+    weight *= np.where(front, 1.0 / (1.0 + squared / _CAUCHY), 0.0) / sigma_px ** 2
+    rows = rows.reshape(7, -1)
+    equations = (rows[:6] * weight.reshape(-1)) @ rows.T
     cost = _CAUCHY * float(np.log1p(squared / _CAUCHY).sum())
-    return _Linearised(residual, squared, H, g, cost)
+    return _Linearised(residual, squared, equations[:, :6], equations[:, 6], cost)
 
 
 _CAUCHY = 2.0 ** 2      # squared distance, in sigmas, at which a residual counts half

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-import torch
+import numpy as np
 from torch import Tensor
 
 
@@ -33,20 +34,19 @@ def log_depth_ratio(depth_a: Tensor, depth_b: Tensor, weights: Tensor) -> ScaleE
 
     weights: [N] >= 0. With nothing to compare the scale is nan and the count 0.
     """
-    usable = (depth_a > 0) & (depth_b > 0) & (weights > 0)
-    usable &= torch.isfinite(depth_a) & torch.isfinite(depth_b)
-    ratios = torch.log(depth_a[usable].double() / depth_b[usable].double())
-    if ratios.numel() == 0:
+    a, b, w = (x.cpu().numpy().astype(np.float64) for x in (depth_a, depth_b, weights))
+    usable = (a > 0) & (b > 0) & (w > 0) & np.isfinite(a) & np.isfinite(b)
+    ratios, w = np.log(a[usable] / b[usable]), w[usable]
+    if not len(ratios):
         return ScaleEstimate(float('nan'), float('inf'), 0)
-    weights = weights[usable].double()
-    centre = weighted_median(ratios, weights)
-    spread = 1.4826 * weighted_median((ratios - centre).abs(), weights)
-    return ScaleEstimate(float(torch.exp(centre)), float(spread), ratios.numel())
+    centre = weighted_median(ratios, w)
+    spread = 1.4826 * weighted_median(np.abs(ratios - centre), w)
+    return ScaleEstimate(math.exp(centre), spread, len(ratios))
 
 
-def weighted_median(values: Tensor, weights: Tensor) -> Tensor:
-    """The value [] at which half the weight lies on either side; values, weights [N]."""
+def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    """The value at which half the weight lies on either side; values, weights [N]."""
     order = values.argsort()
-    below = weights[order].cumsum(0)
-    half = torch.searchsorted(below, 0.5 * below[-1:])
-    return values[order][half.clamp_max(len(values) - 1)][0]
+    below = weights[order].cumsum()
+    half = np.searchsorted(below, 0.5 * below[-1])
+    return float(values[order[min(half, len(values) - 1)]])
