@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..config import FollowingConfig
 from ..geometry import camera, sim3
-from ..registration.flow import LEVELS, TIGHT_LEVELS, refine
+from ..registration.flow import LEVELS, TIGHT_LEVELS, TIGHT_ROUND_TRIP_PX, refine
 from ..registration.rigid import RigidSolution, solve_rigid, solve_rigid_from_scratch
 from ..types import Keyframe
 from .landmarks import LandmarkCache
@@ -119,7 +119,8 @@ class Follower:
             world = points_cam @ T[:3, :3].T + T[:3, 3]
             uv = camera.project(sim3.transform(T_cam_world, torch.from_numpy(world)), K).numpy()
             matches = refine(keyframe.frame.grey, grey, landmarks.uv, uv,
-                             _SEARCH_PX if wide else _TIGHT_PX, None if wide else 0.7,
+                             _SEARCH_PX if wide else _TIGHT_PX,
+                             None if wide else TIGHT_ROUND_TRIP_PX,
                              LEVELS if wide else TIGHT_LEVELS)
             searched = searched if index else matches.searched
             hit = matches.valid

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..geometry import camera, sim3
-from ..registration.flow import SMALL_PX, TIGHT_LEVELS, refine
+from ..registration.flow import SMALL_PX, TIGHT_LEVELS, TIGHT_ROUND_TRIP_PX, refine
 from ..types import Keyframe
 from .landmarks import LandmarkCache, Landmarks
 
@@ -55,8 +55,8 @@ def _of_one(keyframe: Keyframe, landmarks: Landmarks, grey: np.ndarray, K: Tenso
     sigma = landmarks.relative_sigma(keyframe, sigma_depth)
     world = sim3.transform(keyframe.T_world_kf, torch.from_numpy(landmarks.points(keyframe)))
     uv = camera.project(sim3.transform(sim3.inverse(T_world_cam), world), K).numpy()
-    found = refine(keyframe.frame.grey, grey, landmarks.uv, uv, levels=TIGHT_LEVELS,
-                   window_px=SMALL_PX)
+    found = refine(keyframe.frame.grey, grey, landmarks.uv, uv,
+                   max_round_trip_px=TIGHT_ROUND_TRIP_PX, levels=TIGHT_LEVELS, window_px=SMALL_PX)
     hit = found.valid
     points = world.numpy()[hit]
     spread = (points - keyframe.T_world_kf[:3, 3].numpy()) * sigma[hit, None]

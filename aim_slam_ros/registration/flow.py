@@ -15,6 +15,7 @@ WINDOW_PX = 21    # of a search
 SMALL_PX = 15     # enough where the prediction is nearly right, in two thirds of the time
 LEVELS = 3        # a search over the whole pyramid: reaches some 90 px
 TIGHT_LEVELS = 1  # enough from a prediction that is right within some 12 px
+TIGHT_ROUND_TRIP_PX = 0.5   # refuses as many covered points there as .7 after a wide search
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.02)
 _ROUGHLY = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 8, 0.05)   # the way back
 
@@ -60,8 +61,8 @@ def refine(a: np.ndarray, b: np.ndarray, uv_a: np.ndarray, uv_b_predicted: np.nd
     ok &= np.linalg.norm(found - uv_b[rows], axis=1) <= max_move_px
     ok &= _inside(found, b)
     if max_round_trip_px is not None and ok.any():
-        # After a tight search the full resolution alone, begun where it should end, tells the same
-        # of 99 in 100 matches, in half the time; after a wide one it would believe too much.
+        # After a tight search the full resolution alone, begun where it should end, tells nearly
+        # the same in half the time; after a wide one it would believe too much.
         back, back_ok = _flow(b, a, found[ok], start[ok], levels if levels > TIGHT_LEVELS else 0,
                               window_px, _ROUGHLY)
         ok[ok] = back_ok & (np.linalg.norm(back - start[ok], axis=1) <= max_round_trip_px)
