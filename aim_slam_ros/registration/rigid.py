@@ -121,8 +121,8 @@ def _linearise(T: np.ndarray, X: np.ndarray, uv: np.ndarray, K: np.ndarray,
         rows[:, 2] = e_u * rows[:, 0] + e_v * rows[:, 1]
         squared += weight[2] * rows[6, 2] ** 2 / sigma_px ** 2
     weight *= np.where(front, 1.0 / (1.0 + squared / _CAUCHY), 0.0) / sigma_px ** 2
-    rows = rows.reshape(7, -1)
-    equations = (rows[:6] * weight.reshape(-1)) @ rows.T
+    flat = rows.reshape(7, -1)
+    equations = (flat[:6] * weight.reshape(-1)) @ flat.T
     cost = _CAUCHY * float(np.log1p(squared / _CAUCHY).sum())
     return _Linearised(residual, squared, equations[:, :6], equations[:, 6], cost)
 
