@@ -103,7 +103,7 @@ def test_names_can_be_remapped_and_put_into_a_namespace(bag: Path, tmp_path: Pat
 
 
 def test_it_begins_again_until_it_is_interrupted_twice(bag: Path, tmp_path: Path) -> None:
-    with Peer() as peer, Process(tmp_path / 'play.log', PLAY, str(bag), '--loop', '--rate', '20',
+    with Peer() as peer, Process(tmp_path / 'play.log', PLAY, str(bag), '--loop', '--rate', '5',
                                  '--topics', 'image') as player:
         images = peer.hear(Image, '/image')
         wait_for(lambda: len(images) > 2 * COUNT, 'a third round')
@@ -132,7 +132,9 @@ def test_a_subscriber_that_wants_latched_images_is_told_apart(bag: Path, node: N
     with Peer() as peer:
         peer.hear(Image, '/image', quality)
         player = Player(node, bag)
-        wait_for(lambda: node.get_subscriptions_info_by_topic('/image'), 'discovery')
+        # A subscription may be known a moment before its node's name is.
+        wait_for(lambda: [info.node_name for info in node.get_subscriptions_info_by_topic(
+            '/image')] == [peer.node.get_name()], 'discovery')
         with pytest.raises(PlayError, match=f'{peer.node.get_name()}.*QoS that does not'):
             player.wait_for_subscriber(0.1)
 
