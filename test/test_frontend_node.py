@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 
 from aim_slam_ros.types import FrameReport, TrackingStatus
 from msg_adapters import images
+from msg_adapters.diagnostics import values_of
 from msg_adapters.frames import frame_report
 from msg_adapters.stamps import stamp_msg, stamp_ns
 
@@ -213,7 +214,7 @@ def test_a_map_is_made_and_told(driver: Driver, clip: Clip) -> None:
 
 
 def _values(message: DiagnosticArray) -> dict[str, str]:
-    return {v.key: v.value for v in message.status[0].values}
+    return values_of(message, '/frontend: tracking')
 
 
 def _different(tables: list[PointCloud2]) -> int:

@@ -143,6 +143,7 @@ def _nothing_to_save(stage: Stage) -> None:
 
 def _asks_for_keyframes(stage: Stage) -> None:
     stage.process.says('asked the frontend for its keyframes: 0 keyframes follow')
+    assert stage.process.output.count('asked the frontend') == 1
 
 
 def _maps_what_the_frontend_saw(stage: Stage, clip: clips.Clip) -> None:

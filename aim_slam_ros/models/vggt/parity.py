@@ -77,7 +77,7 @@ def begun(network: Vggt, patches: Tensor, grid: Grid, together: bool = True) -> 
 
 def _points_world(depth: Tensor, K: Tensor, T_cam_world: Tensor) -> Tensor:
     """[N,H,W,3] float64."""
-    T_world_cam = sim3.inverse(T_cam_world.double())
+    T_world_cam = sim3.inverse(T_cam_world.double().cpu()).to(depth.device)
     points = camera.unproject(depth.double(), K.double())
     turned = points.flatten(1, 2) @ T_world_cam[:, :3, :3].mT + T_world_cam[:, None, :3, 3]
     return turned.view_as(points)
