@@ -106,6 +106,15 @@ def test_a_moved_keyframe_is_found_where_it_is_now() -> None:
     assert [k.keyframe_id for k in keyframes.overlapping(0)] == [1]
 
 
+def test_many_small_moves_are_one_large_one() -> None:
+    keyframes = _walk(2)
+    for _ in range(200):
+        T = keyframes[1].T_world_kf.clone()
+        T[0, 3] += 0.03     # of some 4 m of depth: none of these steps alone counts
+        keyframes.move([KeyframePose(1, T)])
+    assert keyframes.overlapping(0) == (), 'it is 6 m away, past the wall'
+
+
 def test_newer_keyframes_move_along_with_a_correction() -> None:
     """It knows 0 to 2: what stands between 2 and 3 stays, also in scale."""
     keyframes = _walk(4)
@@ -119,6 +128,22 @@ def test_newer_keyframes_move_along_with_a_correction() -> None:
                                                  keyframes[3].T_world_kf))]
     assert torch.allclose(between[0], between[1])
     assert {k.keyframe_id for k in keyframes.all} == {0, 1, 2, 3}
+
+
+def test_keyframes_that_a_correction_has_not_connected_stay_beside_the_others() -> None:
+    """An event was lost: loop closure has 1 and 3 in pieces of their own, and joined 3 to 0's."""
+    keyframes = _walk(1)
+    keyframes.begin_piece()
+    for k, T in enumerate(box_room.trajectory(4)[1:]):
+        _add(keyframes, T, 4 + k)
+    before = [k.T_world_kf for k in keyframes.all]
+    keyframes.correct(CorrectedKeyframes(
+        1, (KeyframePose(0, before[0]), KeyframePose(1, before[1]),
+            KeyframePose(3, MOVE @ before[3])), {0: 0, 1: 1, 3: 0}))
+    assert [k.piece_id for k in keyframes.all] == [0, 0, 0, 0]
+    for i in (1, 2, 3):
+        assert torch.allclose(keyframes[i].T_world_kf, MOVE @ before[i])
+    assert {k.keyframe_id for k in keyframes.overlapping(1)} >= {2, 3}
 
 
 @pytest.mark.parametrize('known', [(), (77,)])

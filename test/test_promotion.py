@@ -114,6 +114,28 @@ def test_without_measured_depth_the_followed_points_carry_over(
     assert sure > new.confidence.min() and new.confidence.max() < 2.0, 'and it is honest'
 
 
+def test_a_plane_carries_over_as_it_is(clip: Clip) -> None:
+    """A floor, of which inverse depth is linear in the image: no keyframe may push it away."""
+    keyframes = clips.true_map(clip, [10])
+    encoding, K = clips.encoding(clip, 13), _K(clip)
+    height, width = encoding.frame.height, encoding.frame.width
+    x, z = torch.meshgrid(torch.linspace(-20, 20, 201), torch.linspace(2, 20, 60), indexing='ij')
+    floor = torch.stack([x, torch.full_like(x, 1.2), z], -1).reshape(-1, 3).double()
+    uv = camera.project(floor, K)
+    seen = camera.inside(uv, height, width)
+    followed = Followed(True, sim3.identity(), 0.2, {0: 0.2}, floor[seen].numpy(),
+                        uv[seen].float().numpy())
+    nothing = _estimate(clip, keyframes, 13, _prediction(clip, [13, 10], 1.001, True))
+    new = clips.promotion(keyframes).promote(encoding, followed, nothing, K)
+    assert new is not None
+    u, v = uv[seen].round().long().T
+    at_pixel = K[1, 1] * 1.2 / (v - K[1, 2])
+    error = (new.points_cam[v, u, 2] / at_pixel).log()
+    z = floor[seen, 2]
+    inside = (z > 3) & (z < 15) & (u > 25) & (u < width - 25)   # of all points: linear between
+    assert abs(float(error.median())) < 1e-3 and float(error[inside].abs().quantile(0.95)) < 2e-3
+
+
 def test_nothing_known_makes_no_keyframe(clip: Clip) -> None:
     keyframes = clips.true_map(clip, [10])
     prediction = _prediction(clip, [13, 10], 1.001, True)

@@ -28,6 +28,7 @@ class KeyframeMap:
         self._descriptors: list[Tensor] = []
         self.piece_id = self.pieces_begun = 0
         self._index: VoxelIndex | None = None
+        self._indexed_at: dict[int, Tensor] = {}    # T_world_kf
 
     def __getitem__(self, keyframe_id: int) -> Keyframe:
         return self._keyframes[keyframe_id]
@@ -47,6 +48,7 @@ class KeyframeMap:
         self.piece_id = self.pieces_begun = self.pieces_begun + 1
         self._piece_ids = []
         self._index = None
+        self._indexed_at.clear()
 
     def add(self, encoding: FrameEncoding, K: Tensor, points_cam: Tensor, confidence: Tensor,
             T_world_kf: Tensor) -> Keyframe:
@@ -59,7 +61,7 @@ class KeyframeMap:
         self._descriptors.append(encoding.descriptor)
         if self._index is None:
             self._index = VoxelIndex(relative_voxel_size(keyframe, self._config))
-        self._index.insert(keyframe.keyframe_id, confident_points(keyframe, self._config))
+        self._insert(self._index, keyframe)
         return keyframe
 
     def fuse(self, keyframe: Keyframe) -> None:
@@ -80,33 +82,34 @@ class KeyframeMap:
     def correct(self, corrected: CorrectedKeyframes) -> None:
         """Take the poses of a pose-graph optimisation, and the pieces that it joined.
 
-        Keyframes of the current piece that it does not know yet move along with the newest one
-        that it knows.
+        Keyframes of the current piece that it does not know yet, or has not connected with the
+        others yet, move along with the newest one that it knows.
         """
-        poses = [p for p in corrected.poses if p.keyframe_id in self._keyframes]
-        known = {pose.keyframe_id: pose.T_world_kf for pose in poses}
-        anchor = max((i for i in self._piece_ids if i in known), default=None)
+        poses = {p.keyframe_id: p.T_world_kf for p in corrected.poses
+                 if p.keyframe_id in self._keyframes}
+        anchor = max((i for i in self._piece_ids if i in poses), default=None)
         if anchor is not None:
-            T_new_old = known[anchor] @ sim3.inverse(self._keyframes[anchor].T_world_kf)
-            poses += [KeyframePose(i, T_new_old @ self._keyframes[i].T_world_kf)
-                      for i in self._piece_ids if i not in known]
-        self._place(poses)
+            piece_id = corrected.pieces.get(anchor)
+            T_new_old = poses[anchor] @ sim3.inverse(self._keyframes[anchor].T_world_kf)
+            poses |= {i: T_new_old @ self._keyframes[i].T_world_kf for i in self._piece_ids
+                      if i not in poses or corrected.pieces.get(i) != piece_id}
+        self._place([KeyframePose(i, T) for i, T in poses.items()])
         self._join(corrected.pieces, anchor)
 
     def _place(self, poses: Sequence[KeyframePose]) -> None:
         for pose in poses:
-            old = self._keyframes[pose.keyframe_id]
-            keyframe = replace(old, T_world_kf=pose.T_world_kf)
+            keyframe = replace(self._keyframes[pose.keyframe_id], T_world_kf=pose.T_world_kf)
             self._keyframes[pose.keyframe_id] = keyframe
             if self._index is not None and pose.keyframe_id in self._index \
-                    and _displacement(old, keyframe) > _MOVED:
+                    and _displacement(keyframe, self._indexed_at[pose.keyframe_id]) > _MOVED:
                 self._index.move(pose.keyframe_id, confident_points(keyframe, self._config))
+                self._indexed_at[pose.keyframe_id] = pose.T_world_kf
 
     def _join(self, pieces: Mapping[int, int], anchor: int | None) -> None:
         """Take over which piece each keyframe is in; the current piece may have become older."""
         if anchor is not None and anchor in pieces:
             current = pieces[anchor]
-            pieces = {i: current for i in self._piece_ids} | dict(pieces)
+            pieces = dict(pieces) | {i: current for i in self._piece_ids}
             self.piece_id = current
         for i, piece_id in pieces.items():
             if i in self._keyframes and self._keyframes[i].piece_id != piece_id:
@@ -122,8 +125,13 @@ class KeyframeMap:
         """Anew, since the joined piece may have a unit of its own."""
         first = self._keyframes[self._piece_ids[0]]
         self._index = VoxelIndex(relative_voxel_size(first, self._config))
+        self._indexed_at.clear()
         for keyframe in self.piece:
-            self._index.insert(keyframe.keyframe_id, confident_points(keyframe, self._config))
+            self._insert(self._index, keyframe)
+
+    def _insert(self, index: VoxelIndex, keyframe: Keyframe) -> None:
+        index.insert(keyframe.keyframe_id, confident_points(keyframe, self._config))
+        self._indexed_at[keyframe.keyframe_id] = keyframe.T_world_kf
 
     def overlapping(self, keyframe_id: int) -> tuple[Keyframe, ...]:
         """The piece's other keyframes by shared voxels, most first (paper, SIGMA a)."""
@@ -141,9 +149,9 @@ class KeyframeMap:
         return [self._keyframes[self._piece_ids[int(i)]] for i in best]
 
 
-def _displacement(old: Keyframe, new: Keyframe) -> float:
-    """How far the middle of what it sees moved, relative to its distance."""
-    middle = old.points_cam[::8, ::8].reshape(-1, 3).nanmedian(dim=0).values.cpu().double()
-    a, b = (sim3.transform(k.T_world_kf, middle) for k in (old, new))
-    reach = (a - sim3.translation_of(old.T_world_kf)).norm().clamp_min(1e-9)
+def _displacement(keyframe: Keyframe, T_world_before: Tensor) -> float:
+    """How far the middle of what it sees moved from there, relative to its distance."""
+    middle = keyframe.points_cam[::8, ::8].reshape(-1, 3).nanmedian(dim=0).values.cpu().double()
+    a, b = (sim3.transform(T, middle) for T in (T_world_before, keyframe.T_world_kf))
+    reach = (a - sim3.translation_of(T_world_before)).norm().clamp_min(1e-9)
     return float((a - b).norm() / reach)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Mapping
 
@@ -22,6 +23,7 @@ from .window import WindowEstimate
 
 _CARRIED = 1.2        # confidence of a depth carried over from older keyframes, at its points
 _BETWEEN = 1.02       # and between them
+_COARSE_PX = 4        # distance of the pixels where it is interpolated
 _BETTER = 3           # so many times the observations that loop closure was told of: worth telling
 _AT_ONCE = 3          # keyframes told once more beside a new one, megabytes each
 _EDGE_SIGMA = (0.02, 0.02, 0.02, 0.006, 0.006, 0.006, 0.02)   # translation by median depth
@@ -126,14 +128,16 @@ def _carried(frame: Frame, followed: Followed, K: Tensor) -> tuple[Tensor, Tenso
     z = sim3.transform(T_cam_world, torch.from_numpy(followed.points_world))[:, 2].numpy()
     front = z > 0
     uv, rho = followed.uv[front].astype(np.float64), 1.0 / z[front]
-    step = 4
-    v, u = np.mgrid[0:frame.height:step, 0:frame.width:step]
+    # From border to border: the resampling then puts every sample where it was taken.
+    rows, columns = (np.linspace(0.0, length - 1.0, math.ceil(length / _COARSE_PX))
+                     for length in (frame.height, frame.width))
+    v, u = np.meshgrid(rows, columns, indexing='ij')
     coarse = LinearNDInterpolator(uv, rho)(u, v)
     outside = np.isnan(coarse)
     coarse[outside] = NearestNDInterpolator(uv, rho)(u[outside], v[outside])
     grid = torch.nn.functional.interpolate(
         torch.from_numpy(coarse)[None, None].float(), (frame.height, frame.width),
-        mode='bilinear')[0, 0]
+        mode='bilinear', align_corners=True)[0, 0]
     confidence = torch.full(grid.shape, _BETWEEN)
     at = np.rint(uv).astype(np.int64)
     confidence[at[:, 1], at[:, 0]] = _CARRIED
