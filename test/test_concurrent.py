@@ -6,13 +6,14 @@ import threading
 from typing import Sequence
 
 import clip as clips
+import numpy as np
 import pytest
 import torch
 from clip import Clip
 from room_walk import ate
 from torch import Tensor
 
-from aim_slam_ros.frontend.concurrent import ConcurrentFrontend, PlacedResult
+from aim_slam_ros.frontend.concurrent import ConcurrentFrontend, ModelFailure, PlacedResult
 from aim_slam_ros.frontend.odometry import OdometryFrame
 from aim_slam_ros.geometry import sim3
 from aim_slam_ros.models import make_model
@@ -56,8 +57,9 @@ class Run:
 
     def feed(self, index: int, wait: bool = True) -> list[PlacedResult]:
         """One image; wait: for the model too, where it was asked."""
-        new = self.frontend.process(self.clip.stamps_ns[index], self.clip.images[index],
-                                    self.clip.K)
+        new = self.frontend.collect()
+        new += self.frontend.process(self.clip.stamps_ns[index], self.clip.images[index],
+                                     self.clip.K)
         if wait and self.frontend.busy:
             new += self.answer()
         self.placed += new
@@ -169,12 +171,36 @@ def test_what_the_model_raises_reaches_the_caller_once(clip: Clip) -> None:
     while not run.frontend.busy:
         run.feed(index, wait=False)
         index += 1
-    with pytest.raises(RuntimeError, match='out of memory'):
+    with pytest.raises(ModelFailure, match='RuntimeError: out of memory') as failure:
         run.answer()
+    assert failure.value.result is not None, 'or the image would never be answered'
+    assert failure.value.result.stamp_ns == clip.stamps_ns[index - 1]
+    assert failure.value.result.status is TrackingStatus.INITIALISING
+    assert run.frontend.collect() == []
     run.gate.broken = False
     for later in range(index, len(clip)):
         run.feed(later)
     assert len(run.poses()) > 0.5 * len(clip), 'it goes on'
+
+
+def test_a_camera_that_is_lost_while_the_model_fails_is_found_again(clip: Clip) -> None:
+    run, index = Run(clip), 0
+    while not run.poses():
+        run.feed(index)
+        index += 1
+    run.gate.broken = True
+    black = clip.images[index] // 40 + np.random.default_rng(0).integers(
+        0, 60, clip.images[index].shape, np.uint8)
+    for k in range(3):
+        assert run.frontend.process(clip.stamps_ns[index] + k, black, clip.K) == []
+        with pytest.raises(ModelFailure) as failure:
+            run.answer()
+        assert failure.value.result is not None
+        assert failure.value.result.status is TrackingStatus.LOST
+        assert failure.value.result.reason.endswith('the model failed')
+    run.gate.broken = False
+    (placed,) = run.feed(index + 1)[:1]
+    assert placed.result.status is TRACKED
 
 
 def test_another_world_begins_where_the_camera_was() -> None:

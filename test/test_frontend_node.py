@@ -213,6 +213,29 @@ def test_a_map_is_made_and_told(driver: Driver, clip: Clip) -> None:
     assert float(values['memory_mb']) > 50.0
 
 
+def test_a_failing_model_takes_no_pose_from_an_image(tmp_path: Path, clip: Clip) -> None:
+    """It is asked about every image; each is followed, and what fails is said, not each time."""
+    with Peer() as peer, Process(tmp_path / 'log', 'failing_frontend', '--ros-args', *SMALL,
+                                 '-p', 'model.infer:=every_image') as process:
+        driver = Driver(peer, process)
+        told = peer.hear(DiagnosticArray, '/diagnostics')
+        index = 0
+        while not driver.poses and index < 40:
+            driver.send(clip.images[index])
+            index += 1
+        process.signal(signal.SIGUSR1)
+        process.says('from now on the model fails')
+        after = [driver.send(image).result for image in clip.images[index:index + 10]]
+        assert [r.status for r in after] == [TrackingStatus.TRACKED] * 10
+        wait_for(lambda: told and int(_values(told[-1])['model_errors']) >= 5, 'the count')
+        assert 'the model failed: RuntimeError: another program took the memory' in process.output
+        assert process.output.count('the model failed') <= 2
+        assert process.alive and int(_values(told[-1])['errors']) == 0
+        driver.reset()
+        first = [driver.send(image).result for image in clip.images[:12]]
+        assert {r.status for r in first} == {TrackingStatus.INITIALISING}, 'each is answered'
+
+
 def _values(message: DiagnosticArray) -> dict[str, str]:
     return values_of(message, '/frontend: tracking')
 

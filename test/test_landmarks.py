@@ -69,14 +69,14 @@ def test_the_grid_keeps_away_from_what_is_least_known(clip: Clip) -> None:
     straddling = (at[:, 0] - first) // SIDE == (limit - first) // SIDE
     assert straddling.any() and (at[straddling, 0] >= limit).any()
     assert (landmarks.uv[straddling, 0] < limit).all()
-    known = landmarks.seen(keyframe).uv
+    known = landmarks.seen().uv
     assert len(known) and (known[:, 0] < limit).all()
 
 
 def test_landmarks_that_learnt_nothing_are_none(clip: Clip) -> None:
     keyframe = clips.true_map(clip, [10])[0]
     nothing = replace(keyframe, confidence=torch.full_like(keyframe.confidence, 1.0))
-    assert len(matched_grid(24).of(nothing).seen(nothing).uv) == 0
+    assert len(matched_grid(24).of(nothing).seen().uv) == 0
 
 
 def test_landmarks_are_corners_of_what_was_seen(clip: Clip) -> None:
@@ -87,17 +87,22 @@ def test_landmarks_are_corners_of_what_was_seen(clip: Clip) -> None:
     assert 50 < len(landmarks.uv) <= FollowingConfig().points
     assert (landmarks.uv[:, 0] > 42).all() and landmarks.uv[:, 0].min() < 70
     assert len(landmarks.strongest(7).uv) == 7
-    points = landmarks.points(keyframe)
+    points = landmarks.points
     at = np.rint(landmarks.uv).astype(int)
     assert np.allclose(points[:, 2], keyframe.points_cam[at[:, 1], at[:, 0], 2].numpy())
 
 
-def test_landmarks_stay_the_same_while_the_keyframe_learns(clip: Clip) -> None:
+def test_landmarks_stay_where_they_are_while_the_keyframe_learns(clip: Clip) -> None:
     keyframe, cache = clips.true_map(clip, [10])[0], followed_corners(FollowingConfig())
     first = cache.of(keyframe)
-    grown = replace(keyframe, points_cam=keyframe.points_cam * 2, observations=2)
-    assert cache.of(grown) is first
-    assert np.allclose(first.points(grown), 2 * first.points(keyframe))
+    moved = replace(keyframe, T_world_kf=2 * keyframe.T_world_kf)
+    assert cache.of(moved) is first, 'a keyframe that only moved is not read again'
+    grown = replace(keyframe, points_cam=keyframe.points_cam * 2,
+                    confidence=keyframe.confidence + 1, observations=2)
+    again = cache.of(grown)
+    assert np.array_equal(again.uv, first.uv)
+    assert np.allclose(again.points, 2 * first.points)
+    assert torch.allclose(again.confidence, first.confidence + 1)
 
 
 def test_sigma_of_a_depth_follows_its_confidence() -> None:

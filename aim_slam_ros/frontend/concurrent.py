@@ -18,6 +18,14 @@ from .odometry import OdometryFrame
 from .pipeline import FrontendPipeline
 
 
+class ModelFailure(RuntimeError):
+    """What the model raised is the cause. result: of its image, where that has none yet."""
+
+    def __init__(self, error: Exception, result: FrameResult | None) -> None:
+        super().__init__(f'the model failed: {type(error).__name__}: {error}')
+        self.result = result
+
+
 @dataclass(frozen=True)
 class PlacedResult:
     """A result in the odom frame.
@@ -64,30 +72,28 @@ class ConcurrentFrontend:
 
     def process(self, stamp_ns: int, image: np.ndarray,
                 K: np.ndarray | None = None) -> list[PlacedResult]:
-        """One image as FrontendPipeline takes it; its result and what the model had to add.
+        """One image as FrontendPipeline takes it, and its result; ``collect`` first.
 
-        An image that only the model can place has its result in a later call.
+        An image that only the model can place has its result from ``collect``.
         """
-        placed = self.collect()
         step = self._pipeline.begin(stamp_ns, image, K, may_ask=not self.busy)
-        if step.result is not None:
-            placed.append(self._placed(step.result))
         if step.inquiry is not None:
             self._asked, self._had_pose = step.inquiry, step.result is not None
             self._inquiries.put(step.inquiry)
-        return placed
+        return [] if step.result is None else [self._placed(step.result)]
 
     def collect(self) -> list[PlacedResult]:
         """Take the model's findings and a waiting correction in; call it between two images.
 
-        Raises what the model raised.
+        Raises ModelFailure, once, where it has none.
         """
         placed: list[PlacedResult] = []
         if self._asked is not None and self._findings is not None:
             asked, findings = self._asked, self._findings
             self._asked = self._findings = None
             if isinstance(findings, Exception):
-                raise findings
+                raise ModelFailure(findings, None if self._had_pose else self._pipeline.unanswered(
+                    asked)) from findings
             placed = self._all_placed(self._pipeline.conclude(asked, findings))
         if self._asked is None and self._correction is not None:
             self._odometry.correct(self._pipeline.apply_correction(self._correction))

@@ -113,10 +113,9 @@ class Follower:
             landmarks = self._landmarks.of(keyframe)
             if wide:
                 landmarks = landmarks.strongest(_SEARCH_POINTS)
-            points_cam = landmarks.points(keyframe)
-            sigma = landmarks.relative_sigma(keyframe, self._config.sigma_depth)
+            sigma = landmarks.relative_sigma(self._config.sigma_depth)
             T = keyframe.T_world_kf.numpy()
-            world = points_cam @ T[:3, :3].T + T[:3, 3]
+            world = landmarks.points @ T[:3, :3].T + T[:3, 3]
             uv = camera.project(sim3.transform(T_cam_world, torch.from_numpy(world)), K).numpy()
             matches = refine(keyframe.frame.grey, grey, landmarks.uv, uv,
                              _SEARCH_PX if wide else _TIGHT_PX,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Callable
 
@@ -38,53 +38,69 @@ def relative_depth_sigma(confidence: Tensor, mean_confidence: float,
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Points of one keyframe. uv: [N,2] float32 px."""
+    """N points of one keyframe as it is known by now, in the computer's memory.
+
+    uv: [N,2] float32 px. points: [N,3] float64 in the keyframe's unit. confidence: [N].
+    mean_confidence: the whole keyframe's.
+    """
 
     uv: np.ndarray
+    points: np.ndarray
+    confidence: Tensor
+    mean_confidence: float
 
     def strongest(self, count: int) -> Landmarks:
         """Corners come in order of strength."""
-        return Landmarks(self.uv[:count])
+        return self._only(slice(count))
 
-    def seen(self, keyframe: Keyframe) -> Landmarks:
-        """Those of the better part, as the keyframe is known now; none with a guessed depth."""
-        u, v = self._pixels()
-        confidence = keyframe.confidence[v, u].cpu()
-        least = torch.quantile(confidence, _UNSURE).clamp_min(GUESSED_CONFIDENCE) \
-            if len(confidence) else GUESSED_CONFIDENCE
-        return Landmarks(self.uv[(confidence >= least).numpy()])
+    def seen(self) -> Landmarks:
+        """Those of the better part; none with a guessed depth."""
+        least = torch.quantile(self.confidence, _UNSURE).clamp_min(GUESSED_CONFIDENCE) \
+            if len(self.confidence) else GUESSED_CONFIDENCE
+        return self._only((self.confidence >= least).numpy())
 
-    def points(self, keyframe: Keyframe) -> np.ndarray:
-        """[N,3] float64 in the keyframe's unit, from its pointmap as it is now."""
-        u, v = self._pixels()
-        return keyframe.points_cam[v, u].cpu().double().numpy()
-
-    def relative_sigma(self, keyframe: Keyframe, sigma_at_mean: float) -> np.ndarray:
+    def relative_sigma(self, sigma_at_mean: float) -> np.ndarray:
         """[N] relative standard deviation of their depths."""
-        u, v = self._pixels()
-        return relative_depth_sigma(keyframe.confidence[v, u].cpu(), keyframe.mean_confidence,
-                                    sigma_at_mean).numpy()
+        return relative_depth_sigma(self.confidence, self.mean_confidence, sigma_at_mean).numpy()
 
-    def _pixels(self) -> tuple[np.ndarray, np.ndarray]:
-        whole = np.rint(self.uv).astype(np.int64)
-        return whole[:, 0], whole[:, 1]
+    def _only(self, rows: slice | np.ndarray) -> Landmarks:
+        return replace(self, uv=self.uv[rows], points=self.points[rows],
+                       confidence=self.confidence[rows])
+
+
+@dataclass(frozen=True)
+class _Cached:
+    observations: int
+    landmarks: Landmarks
 
 
 class LandmarkCache:
-    """Landmarks by keyframe id; the least recently used are dropped and can be made again."""
+    """Landmarks by keyframe id; the least recently used are dropped and can be made again.
 
-    def __init__(self, choose: Callable[[Keyframe], Landmarks]) -> None:
+    What is known of them is read once for each of the keyframe's observations: pointmaps may be on
+    a GPU, where a read would wait for the inference that is under way.
+    """
+
+    def __init__(self, choose: Callable[[Keyframe], np.ndarray]) -> None:
+        """choose: their pixels [N,2], kept while the keyframe learns."""
         self._choose = choose
-        self._cache: OrderedDict[int, Landmarks] = OrderedDict()
+        self._cache: OrderedDict[int, _Cached] = OrderedDict()
 
     def of(self, keyframe: Keyframe) -> Landmarks:
-        found = self._cache.pop(keyframe.keyframe_id, None)
-        if found is None:
-            found = self._choose(keyframe)
-        self._cache[keyframe.keyframe_id] = found
+        cached = self._cache.pop(keyframe.keyframe_id, None)
+        if cached is None or cached.observations != keyframe.observations:
+            uv = self._choose(keyframe) if cached is None else cached.landmarks.uv
+            cached = _Cached(keyframe.observations, _known(keyframe, uv))
+        self._cache[keyframe.keyframe_id] = cached
         if len(self._cache) > _CACHED:
             self._cache.popitem(last=False)
-        return found
+        return cached.landmarks
+
+
+def _known(keyframe: Keyframe, uv: np.ndarray) -> Landmarks:
+    u, v = np.rint(uv).astype(np.int64).T
+    return Landmarks(uv, keyframe.points_cam[v, u].cpu().double().numpy(),
+                     keyframe.confidence[v, u].cpu(), keyframe.mean_confidence)
 
 
 def followed_corners(config: FollowingConfig) -> LandmarkCache:
@@ -102,16 +118,16 @@ def matched_grid(stride_px: int) -> LandmarkCache:
     return LandmarkCache(partial(_best_of_squares, stride_px))
 
 
-def _corners(config: FollowingConfig, keyframe: Keyframe) -> Landmarks:
+def _corners(config: FollowingConfig, keyframe: Keyframe) -> np.ndarray:
     mask = (~_unsure(keyframe)).astype(np.uint8)
     mask[:_BORDER_PX], mask[-_BORDER_PX:] = 0, 0
     mask[:, :_BORDER_PX], mask[:, -_BORDER_PX:] = 0, 0
     corners = cv2.goodFeaturesToTrack(keyframe.frame.grey, config.points, 0.003,
                                       config.spacing_px, mask=mask)
-    return Landmarks(np.zeros((0, 2), np.float32) if corners is None else corners[:, 0])
+    return np.zeros((0, 2), np.float32) if corners is None else corners[:, 0]
 
 
-def _best_of_squares(stride_px: int, keyframe: Keyframe) -> Landmarks:
+def _best_of_squares(stride_px: int, keyframe: Keyframe) -> np.ndarray:
     # As many in a small image: a solve needs their number, not their distance.
     side = max(1, round(stride_px * keyframe.frame.width / 518.0))
     texture = cv2.cornerMinEigenVal(keyframe.frame.grey, _TEXTURE_PX)
@@ -124,7 +140,7 @@ def _best_of_squares(stride_px: int, keyframe: Keyframe) -> Landmarks:
     v, u = np.divmod(squares.argmax(-1), side)
     v += top + side * np.arange(rows)[:, None]
     u += left + side * np.arange(columns)
-    return Landmarks(np.stack([u, v], -1).reshape(-1, 2).astype(np.float32))
+    return np.stack([u, v], -1).reshape(-1, 2).astype(np.float32)
 
 
 def _unsure(keyframe: Keyframe) -> np.ndarray:

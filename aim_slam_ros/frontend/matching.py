@@ -41,7 +41,7 @@ class PredictedMatches:
 def predict_matches(keyframes: Sequence[Keyframe], landmarks: LandmarkCache, grey: np.ndarray,
                     K: Tensor, T_world_cam: Tensor, sigma_depth: float) -> PredictedMatches:
     """Project each keyframe's landmarks, as far as seen, into the image and refine them there."""
-    parts = [_of_one(k, landmarks.of(k).seen(k), grey, K, T_world_cam, sigma_depth)
+    parts = [_of_one(k, landmarks.of(k).seen(), grey, K, T_world_cam, sigma_depth)
              for k in keyframes]
     owner = np.concatenate([np.full(len(p[1]), i) for i, p in enumerate(parts)])
     columns = [np.concatenate([p[i] for p in parts]) for i in range(1, 5)]
@@ -52,8 +52,8 @@ def _of_one(keyframe: Keyframe, landmarks: Landmarks, grey: np.ndarray, K: Tenso
             T_world_cam: Tensor, sigma_depth: float
             ) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Landmarks offered, and per match: point, spread (world), pixel, weight."""
-    sigma = landmarks.relative_sigma(keyframe, sigma_depth)
-    world = sim3.transform(keyframe.T_world_kf, torch.from_numpy(landmarks.points(keyframe)))
+    sigma = landmarks.relative_sigma(sigma_depth)
+    world = sim3.transform(keyframe.T_world_kf, torch.from_numpy(landmarks.points))
     uv = camera.project(sim3.transform(sim3.inverse(T_world_cam), world), K).numpy()
     found = refine(keyframe.frame.grey, grey, landmarks.uv, uv,
                    max_round_trip_px=TIGHT_ROUND_TRIP_PX, levels=TIGHT_LEVELS, window_px=SMALL_PX)

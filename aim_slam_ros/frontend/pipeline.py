@@ -113,6 +113,16 @@ class FrontendPipeline:
         return replace(self._result(result, inquiry.clock), piece_id=piece_id,
                        inferences=findings.inferences)
 
+    def unanswered(self, inquiry: Inquiry) -> FrameResult:
+        """Instead of ``conclude`` for an image without a pose, where the model failed."""
+        reason = 'the model failed'
+        if isinstance(inquiry, BeginningInquiry):
+            result = FrameResult(inquiry.frame.stamp_ns, TrackingStatus.INITIALISING,
+                                 reason=reason)
+        else:
+            result = self._lost(inquiry.frame, f'{inquiry.followed.reason}; {reason}')
+        return self._result(result, inquiry.clock)
+
     def apply_correction(self, corrected: CorrectedKeyframes) -> Tensor:
         """Take corrected keyframe poses; call between two images.
 

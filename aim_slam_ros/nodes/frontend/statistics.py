@@ -21,7 +21,8 @@ class FrontendStatistics:
         self._lock = threading.Lock()
         self._arrivals: deque[float] = deque()
         self._poses: deque[tuple[float, float]] = deque()
-        self.received = self.dropped = self.model_errors = self.resets = 0
+        self.received = self.dropped = self.resets = 0
+        self.model_errors = self.errors = 0
         self.counts: Counter[TrackingStatus] = Counter()
         self.last: FrameResult | None = None
         self.reason = ''
@@ -67,7 +68,7 @@ class FrontendStatistics:
             'images_received': self.received, 'images_dropped': self.dropped,
             **{f'images_{status.value}': self.counts[status] for status in TrackingStatus},
             'inferences': self._inferences, 'window': self._window, 'kappa': self._kappa,
-            'model_errors': self.model_errors, 'resets': self.resets,
+            'model_errors': self.model_errors, 'errors': self.errors, 'resets': self.resets,
             'memory_mb': memory_mb()}
 
 

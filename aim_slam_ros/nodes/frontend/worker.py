@@ -18,7 +18,7 @@ from msg_adapters.keyframes import ReceivedCorrection
 from msg_adapters.stamps import stamp_ns
 
 from ...config import Config
-from ...frontend.concurrent import ConcurrentFrontend, PlacedResult
+from ...frontend.concurrent import ConcurrentFrontend, ModelFailure, PlacedResult
 from ...models.base import GeometryModel
 from ...types import FrameResult, TrackingStatus
 from .image_input import ArrivedImage
@@ -27,7 +27,7 @@ from .parameters import FrontendParameters
 from .statistics import FrontendStatistics
 
 _BACKWARDS_NS = 500_000_000   # so far back in time is another beginning, not a late image
-_PERIOD_S = 5.0               # a complaint about images is repeated this often at most
+_PERIOD_S = 5.0               # a complaint is repeated this often at most
 _NEVER = -1
 
 
@@ -116,7 +116,7 @@ class FrontendWorker:
             try:
                 self._turn()
             except Exception:   # one image must not end a robot's localisation
-                self._statistics.model_errors += 1
+                self._statistics.errors += 1
                 self._logger.error('an image failed and is skipped; please report this:\n'
                                    + traceback.format_exc())
 
@@ -146,11 +146,24 @@ class FrontendWorker:
             self._take_correction(received)
         if resend:
             self._resending = deque(k.keyframe_id for k in self._frontend.pipeline.keyframes)
+        self._collect()
         if image is not None:
             self._take_image(image)
-        else:
-            self._publish(self._frontend.collect())
         self._resend_one()
+
+    def _collect(self) -> None:
+        """What the model found; where it failed, images go on being followed without it."""
+        try:
+            self._publish(self._frontend.collect())
+        except ModelFailure as failure:
+            self._statistics.model_errors += 1
+            if self._is_time_to_say('model'):
+                self._logger.error(
+                    f'{failure}; images are followed without it meanwhile. Unless it is for want '
+                    'of memory, please report this:\n'
+                    + ''.join(traceback.format_exception(failure.__cause__)))
+            if failure.result is not None:
+                self._publish([self._frontend.unplaced(failure.result)])
 
     def _restart(self) -> None:
         self._frontend.close()
@@ -179,7 +192,7 @@ class FrontendWorker:
             image = self._decode(arrived.message)
         except MessageError as error:
             skipped = FrameResult(stamp, TrackingStatus.SKIPPED, reason=str(error))
-            self._publish([*self._frontend.collect(), self._frontend.unplaced(skipped)])
+            self._publish([self._frontend.unplaced(skipped)])
             return
         height, width = image.shape[:2]
         self._publish(self._frontend.process(stamp, image, self._K_of(width, height)))
@@ -202,10 +215,15 @@ class FrontendWorker:
             self._logger.info('tracking again')
         if not lost and result.status is not TrackingStatus.SKIPPED:
             return
-        now = time.monotonic()
-        if now - self._said_s.get(result.status.value, -_PERIOD_S) >= _PERIOD_S:
-            self._said_s[result.status.value] = now
+        if self._is_time_to_say(result.status.value):
             self._logger.warning(f'image {result.status.value}: {result.reason}')
+
+    def _is_time_to_say(self, what: str) -> bool:
+        now = time.monotonic()
+        if now - self._said_s.get(what, -_PERIOD_S) < _PERIOD_S:
+            return False
+        self._said_s[what] = now
+        return True
 
     def _resend_one(self) -> None:
         now = time.monotonic()
