@@ -11,6 +11,7 @@ from types import FrameType
 from typing import Collection, Iterator
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_END = b'\0'             # no signal's number
 _DEADLINE_S = 2.0       # from the first signal until the process is gone, whatever it does
 
 
@@ -47,7 +48,7 @@ class StopSignals:
         """From now on the process has until the deadline to be gone, with this exit status."""
         self.told = True
         self._status = status
-        os.write(self._write, b'.')
+        os.write(self._write, _END)
 
     def leave(self, threads: Collection[threading.Thread], status: int) -> None:
         """Leave the process here and now if one of these threads is still at work.
@@ -67,7 +68,9 @@ class StopSignals:
             raise KeyboardInterrupt
 
     def _watch(self) -> None:
-        os.read(self._read, 1)
+        # Each signal that has a handler in Python arrives here as its number.
+        while os.read(self._read, 1) not in (_END, *(bytes([number]) for number in _SIGNALS)):
+            pass
         threading.Event().wait(_DEADLINE_S)
         _exit(self._status)
 
