@@ -149,7 +149,7 @@ class LoopClosureConfig(Section):
     candidates: int = setting(2, 'most similar keyframes that are verified', 1, 10)
     min_gap: int = setting(
         8, 'keyframes nearer in time than this many are no candidates; a longer edge of the '
-        'frontend is verified as a loop', 1, 1000)
+        'frontend is trusted no more than a loop', 1, 1000)
     covisible_hops: int = setting(
         2, 'keyframes within this many edges are no candidates', 0, 10)
     similarity: float = setting(

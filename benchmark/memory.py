@@ -53,6 +53,8 @@ def main() -> int:
     arguments = parser(__doc__)
     arguments.add_argument('--images', type=int, default=10000)
     args = arguments.parse_args()
+    if args.images < PARTS:
+        arguments.error(f'--images {args.images}: at least {PARTS}')
     sequence = load_sequence('rendered:room')
     start = time.perf_counter()
     parts = _walk(sequence, args.images)

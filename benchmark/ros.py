@@ -62,7 +62,9 @@ def _recording(source: Path, out: Path) -> Figures:
     alone = _run('evaluate', source, out / f'{name}_offline')
     figures = {f'{name}_{key}': live[key] for key in _DEMO}
     figures[f'{name}_offline_ate_rmse_m'] = alone['ate_rmse_m']
-    return said(figures | {f'{name}_ate_ratio': live['ate_rmse_m'] / alone['ate_rmse_m']})
+    if live['ate_rmse_m'] is not None and alone['ate_rmse_m']:
+        figures[f'{name}_ate_ratio'] = live['ate_rmse_m'] / alone['ate_rmse_m']
+    return said(figures)
 
 
 def _slow_model(source: Path, out: Path) -> Figures:

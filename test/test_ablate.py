@@ -77,7 +77,8 @@ def test_a_preset_reads_as_if_typed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('content, expected', [
     ('', 'nothing'), ('tables: 3', 'tables'), ('tables: {a: [1, 2]}', 'a'), ('{', 'not YAML'),
-    ('variants: {a: }', 'variants'), ('tables: {t: {a: {method: no}}}', 't: a')])
+    ('variants: {a: }', 'variants'), ('tables: {t: }', 't: has no'),
+    ('tables: {t: {a: {method: no}}}', 't: a')])
 def test_a_wrong_preset_is_refused_by_name(tmp_path: Path, content: str, expected: str) -> None:
     path = tmp_path / 'preset.yaml'
     path.write_text(content)

@@ -45,7 +45,9 @@ def test_the_papers_tracker_has_three_sigmas() -> None:
 def test_only_windows_as_they_start_count() -> None:
     results = [_result(2.0, 2), _result(3.0, 3), _result(None, 2), _result(5.0, 1)]
     assert kappas_of(results, Config()) == [2.0]
-    assert unwidened(Config()).sigma.kappa > 1e12
+    assert unwidened(Config()).sigma.max_window == 3
+    narrow = Config().with_values({'sigma.min_window': '5', 'sigma.max_window': '4'})
+    assert kappas_of(results, narrow) == [3.0], 'a window has at most that many'
 
 
 def test_what_it_prints_gives_a_median_of_one(room: Path,

@@ -49,13 +49,6 @@ def test_K_maps_the_same_ray_to_the_same_place(size: tuple[int, int]) -> None:
     assert float(moved[1]) == pytest.approx((v + 0.5) * resized.scale_y - 0.5 - resized.top_px)
 
 
-@pytest.mark.parametrize('size', SIZES)
-def test_K_comes_back(size: tuple[int, int]) -> None:
-    resized = model_image(_image(*size), 518)
-    K = camera.intrinsics(525.0, 520.0, 0.52 * size[1], 0.47 * size[0])
-    assert torch.allclose(resized.K_camera(resized.K_model(K)), K, rtol=1e-12)
-
-
 def test_a_read_only_image_is_taken() -> None:
     image = _image(48, 64)
     image.flags.writeable = False

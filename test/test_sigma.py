@@ -38,7 +38,6 @@ def test_candidates_are_those_that_share_voxels_best_first() -> None:
     # the side walls reach behind the camera: what looks backwards may share a few voxels
     assert got[:2] == (1, 2)
     assert sigma.candidates(index, 9, replace(CONFIG, candidates=1)) == (1,)
-    assert sigma.candidates(index, 9, CONFIG, exclude=(1,))[0] == 2
 
 
 def test_gain_is_that_of_the_kalman_update() -> None:
@@ -120,7 +119,7 @@ def test_a_confident_keyframe_has_less_to_gain() -> None:
 def test_nothing_to_rank() -> None:
     last, view = _last(), _seen_at(1, 0.3)
     assert sigma.rerank(last, [], CONFIG) == []
-    assert sigma.rerank(last, [last, view], CONFIG, exclude=(1,)) == []
+    assert sigma.rerank(last, [last], CONFIG) == []
     empty = replace(last, points_cam=torch.full_like(last.points_cam, float('nan')))
     assert sigma.rerank(empty, [view], CONFIG) == [sigma.Ranked(1, 0.0)]
     assert sigma.rerank(last, [replace(view, points_cam=empty.points_cam)],

@@ -167,7 +167,6 @@ def test_nothing_projects_from_behind() -> None:
 def test_inside_counts_pixel_centres() -> None:
     uv = torch.tensor([[0.0, 0.0], [59.0, 39.0], [59.5, 10.0], [-0.1, 10.0]])
     assert camera.inside(uv, 40, 60).tolist() == [True, True, False, False]
-    assert camera.inside(uv, 40, 60, border=1.0).tolist() == [False] * 4
 
 
 def test_scaled_intrinsics_see_the_same_ray() -> None:

@@ -43,24 +43,14 @@ def _indexed(clouds: dict[int, Tensor]) -> VoxelIndex:
     return index
 
 
-def test_overlap_is_exact_after_insert_move_and_remove() -> None:
+def test_overlap_is_exact_after_insert_and_move() -> None:
     clouds = _clouds(8)
     index = _indexed(clouds)
     _assert_exact(index, clouds)
     clouds[10] = clouds[10] + torch.tensor([0.6, -0.3, 0.1])
     index.move(10, clouds[10])
     _assert_exact(index, clouds)
-    del clouds[17]
-    index.remove(17)
-    _assert_exact(index, clouds)
-    assert len(index) == 7 and 17 not in index and 10 in index
-
-
-def test_overlap_leaves_out_what_is_excluded() -> None:
-    clouds = _clouds(5)
-    index = _indexed(clouds)
-    got = index.overlap(clouds[3], exclude=(3, 10, 99999))
-    assert not {3, 10} & set(got.keyframe_ids.tolist()) and len(got.keyframe_ids) > 0
+    assert len(index) == 8 and 10 in index and 11 not in index
 
 
 def test_what_is_not_finite_or_astronomically_far_is_ignored() -> None:
@@ -68,18 +58,19 @@ def test_what_is_not_finite_or_astronomically_far_is_ignored() -> None:
     bad = torch.tensor([[float('nan'), 0, 0], [float('inf'), 0, 0], [1e9, 0, 0]])
     index.insert(0, bad)
     index.insert(1, torch.cat([bad, torch.zeros(1, 3)]))
+    index.insert(2, torch.zeros(1, 3))
     assert len(index.overlap_of(0).keyframe_ids) == 0
-    assert index.overlap(torch.zeros(1, 3)).keyframe_ids.tolist() == [1]
-    assert len(VoxelIndex(1.0).overlap(torch.zeros(1, 3)).keyframe_ids) == 0
+    assert index.overlap_of(1).keyframe_ids.tolist() == [2]
 
 
 def test_wrong_use_is_named() -> None:
     index = _indexed(_clouds(2))
     with pytest.raises(VoxelIndexError, match='move it'):
         index.insert(3, torch.zeros(1, 3))
-    for call in (index.remove, index.overlap_of):
-        with pytest.raises(VoxelIndexError, match='insert it first'):
-            call(4)
+    with pytest.raises(VoxelIndexError, match='insert it first'):
+        index.overlap_of(4)
+    with pytest.raises(VoxelIndexError, match='insert it first'):
+        index.move(4, torch.zeros(1, 3))
     for size in (0.0, float('nan')):
         with pytest.raises(VoxelIndexError, match='finite'):
             VoxelIndex(size)
@@ -95,7 +86,8 @@ def test_voxels_do_not_depend_on_the_keyframes_unit() -> None:
     index = VoxelIndex(relative_voxel_size(metres, config))
     index.insert(0, confident_points(metres, config))
     index.insert(1, confident_points(feet, config))
-    voxels = index.overlap(confident_points(metres, config))
+    index.insert(2, confident_points(metres, config))
+    voxels = index.overlap_of(2)
     # float32 rounding may move a point across a face, nothing more
     assert voxels.counts.min() > 0.97 * voxels.counts.max()
 

@@ -13,18 +13,22 @@ _SIGMAS = {
     'image': ('tracking.sigma_model_px',),
     'paper': ('joint_tracking.sigma_ray', 'joint_tracking.sigma_pixel',
               'joint_tracking.sigma_log_distance')}
-_NEVER = 1e30
+
+
+def starting_views(config: Config) -> int:
+    """How many views a window has at first, the current image included."""
+    return min(config.sigma.min_window, config.sigma.max_window)
 
 
 def unwidened(config: Config) -> Config:
     """The configuration with windows that stay as large as they start."""
-    return config.with_values({'sigma.kappa': f'{_NEVER}'})
+    return config.with_values({'sigma.max_window': f'{starting_views(config)}'})
 
 
 def kappas_of(results: Sequence[FrameResult], config: Config) -> list[float]:
     """Of the windows that were as large as a window starts, the current image included."""
     return [r.kappa for r in results
-            if r.kappa is not None and len(r.window) + 1 == config.sigma.min_window]
+            if r.kappa is not None and len(r.window) + 1 == starting_views(config)]
 
 
 def honest_sigmas(config: Config, kappas: Sequence[float]) -> Mapping[str, str]:

@@ -25,7 +25,10 @@ class Images:
 
 @dataclass(frozen=True)
 class Run:
-    """Everything that its figures depend on, the code apart. method: one of METHODS."""
+    """What its figures depend on, but for files: the code, the recording, the weights.
+
+    method: one of METHODS.
+    """
 
     images: Images
     config: Config

@@ -74,9 +74,12 @@ def read_preset(path: Path) -> Preset:
 
 
 def _comparison(title: str, variants: Any, where: str) -> Comparison:
+    named = _mapping(variants, where)
+    if not named:
+        raise VariantError(f'{where}: has no variants')
     return Comparison(title, tuple(
         _variant(name, _settings(settings, f'{where}: {name}'), f'{where}: {name}')
-        for name, settings in _mapping(variants, where).items()))
+        for name, settings in named.items()))
 
 
 def _variant(name: str, settings: dict[str, str], where: str) -> Variant:

@@ -26,8 +26,9 @@ _EPILOG = """
 A variant is NAME:section.key=value,section.key=value. With method=chain or method=pose_mean among
 them it is no SLAM but the model's own poses, chained from image to image or averaged over the
 keyframes of a window. A preset is a YAML file of variants, as benchmark/ablations.yaml. Finished
-runs are kept in DIR/runs and not done again: take a new DIR when the code has changed. The tables
-are printed and written to DIR/tables.md. Rates are of runs beside each other.
+runs are kept in DIR/runs and not done again: take a new DIR when the code, a recording or
+the weights have changed. The tables are printed and written to DIR/tables.md. Rates are of runs
+beside each other.
 """
 
 

@@ -53,10 +53,10 @@ def _calibrate(args: argparse.Namespace) -> int:
     short = [] if args.model is None else [('model.name', args.model)]
     config = configured(args.settings + short)
     kappas = [kappa for source in args.datasets for kappa in _kappas(source, args, config)]
+    from aim_slam_ros.ablation.calibration import honest_sigmas, starting_views
     if len(kappas) < _FEWEST:
-        raise Refusal(f'only {len(kappas)} windows had {config.sigma.min_window} views, too few '
+        raise Refusal(f'only {len(kappas)} windows had {starting_views(config)} views, too few '
                       'for a median: give more or longer datasets')
-    from aim_slam_ros.ablation.calibration import honest_sigmas
     for name, value in honest_sigmas(config, kappas).items():
         print(f'--set {name}={value}')
     return 0

@@ -24,7 +24,7 @@ COARSE_STEP = 8
 
 @dataclass(frozen=True)
 class JointSolution:
-    """links: [n-1,4,4] float64. kappa: reduced chi-square. iterations: steps tried.
+    """links: [n-1,4,4] float64. kappa: reduced chi-square.
 
     information: [7(n-1),7(n-1)] float64 of the links under left perturbations, what is remembered
     included; its inverse is their covariance as far as the sigmas are honest. It has Huber's
@@ -33,7 +33,6 @@ class JointSolution:
 
     links: Tensor
     kappa: float
-    iterations: int
     information: Tensor
 
 
@@ -60,10 +59,9 @@ class _System:
 
 @dataclass(frozen=True)
 class _Descended:
-    """links: [n-1,4,4]. tried: steps. system: where it was linearised last."""
+    """links: [n-1,4,4]. system: where it was linearised last."""
 
     links: Tensor
-    tried: int
     system: _System
 
 
@@ -78,8 +76,7 @@ def solve(links: Tensor, pairs: tuple[PairMatches, ...],
     end = _Descent(pairs, full, memory, config.residual, config).run(near.links)
     data = _assembled(pairs, end.system.carries, end.system.terms.information.cpu())
     remembered = _assembled(pairs, end.system.carries, memory.information)
-    return JointSolution(end.links, _kappa(end.system.terms, data), near.tried + end.tried,
-                         data + remembered)
+    return JointSolution(end.links, _kappa(end.system.terms, data), data + remembered)
 
 
 def _memory(pairs: tuple[PairMatches, ...], coarse: PairResiduals, kind: str) -> _Memory:
@@ -107,22 +104,23 @@ class _Descent:
     def run(self, links: Tensor) -> _Descended:
         """Until a step would gain next to nothing."""
         system, damping = self._system(links), 1e-6
-        tried, limit = 0, self._config.relative_decrease
-        while tried < self._config.max_iterations and damping < 1e6:
-            tried += 1
+        limit = self._config.relative_decrease
+        for _ in range(self._config.max_iterations):
             step = _step(system.equations, damping)
             if step is None:
                 break
             trial = sim3.exp(step.reshape(-1, 7)) @ links
             # A step that promises next to nothing is the last one: no need to look where it ends.
             if 0.5 * float(step @ system.equations.g) < limit * system.cost:
-                return _Descended(trial, tried, system)
+                return _Descended(trial, system)
             new = self._system(trial)
             if new.cost < system.cost:
                 links, system, damping = trial, new, max(damping * 0.1, 1e-9)
             else:
                 damping *= 100.0
-        return _Descended(links, tried, system)
+                if damping >= 1e6:
+                    break
+        return _Descended(links, system)
 
     def _system(self, links: Tensor) -> _System:
         """Perturbed links move a pair by delta_ij = sum over k of Ad(T_i_k) delta_k."""

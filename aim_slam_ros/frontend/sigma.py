@@ -50,23 +50,21 @@ class Activation(Generic[A]):
     tried: tuple[tuple[int, ...], ...]
 
 
-def candidates(index: VoxelIndex, last_id: int, config: SigmaConfig,
-               exclude: tuple[int, ...] = ()) -> tuple[int, ...]:
+def candidates(index: VoxelIndex, last_id: int, config: SigmaConfig) -> tuple[int, ...]:
     """Stage 1: ids of the keyframes that share most voxels with the last one, at most top-N."""
-    ids = index.overlap_of(last_id, exclude).keyframe_ids
+    ids = index.overlap_of(last_id).keyframe_ids
     return tuple(ids[:config.candidates].tolist())
 
 
-def rerank(last: Keyframe, candidates: Sequence[Keyframe], config: SigmaConfig,
-           exclude: tuple[int, ...] = ()) -> list[Ranked]:
-    """Stage 2: the candidates by information gain, best first, without those excluded.
+def rerank(last: Keyframe, candidates: Sequence[Keyframe],
+           config: SigmaConfig) -> list[Ranked]:
+    """Stage 2: the candidates by information gain, best first, without the last one itself.
 
     The gain of a candidate sums 1/2 log det P- / det P+ over the least confident points of the
     last keyframe that it sees, with P+ the Kalman update of their covariance by the candidate's
     ray. By the determinant lemma det P- / det P+ = det(R + J P J^T) / det R.
     """
-    others = [kf for kf in candidates
-              if kf.keyframe_id != last.keyframe_id and kf.keyframe_id not in exclude]
+    others = [kf for kf in candidates if kf.keyframe_id != last.keyframe_id]
     if not others:
         return []
     prior = _uncertain_points(last, config)

@@ -58,10 +58,6 @@ class VoxelIndex:
         self._voxels_of[keyframe_id] = voxels
         self._add(keyframe_id, voxels)
 
-    def remove(self, keyframe_id: int) -> None:
-        self._drop(keyframe_id, self._known(keyframe_id))
-        del self._voxels_of[keyframe_id]
-
     def move(self, keyframe_id: int, points_world: Tensor) -> None:
         """Index the keyframe's points [N,3] anew; only voxels that changed are touched."""
         before, after = self._known(keyframe_id), self._keys(points_world)
@@ -69,20 +65,13 @@ class VoxelIndex:
         self._add(keyframe_id, np.setdiff1d(after, before, assume_unique=True))
         self._voxels_of[keyframe_id] = after
 
-    def overlap(self, points_world: Tensor, exclude: tuple[int, ...] = ()) -> Overlap:
-        """The keyframes that share voxels with points [N,3], without those excluded."""
-        return self._count(self._keys(points_world), exclude)
-
-    def overlap_of(self, keyframe_id: int, exclude: tuple[int, ...] = ()) -> Overlap:
+    def overlap_of(self, keyframe_id: int) -> Overlap:
         """The other keyframes that share voxels with an indexed one."""
-        return self._count(self._known(keyframe_id), (keyframe_id, *exclude))
-
-    def _count(self, voxels: np.ndarray, exclude: tuple[int, ...]) -> Overlap:
         observers = array('i')
-        for voxel in voxels.tolist():
-            observers.extend(self._keyframes_of.get(voxel, ()))
-        counts = np.bincount(np.frombuffer(observers, np.int32)) if observers else np.zeros(0, int)
-        counts[[k for k in exclude if k < len(counts)]] = 0
+        for voxel in self._known(keyframe_id).tolist():
+            observers.extend(self._keyframes_of[voxel])
+        counts = np.bincount(np.frombuffer(observers, np.int32), minlength=keyframe_id + 1)
+        counts[keyframe_id] = 0
         ids = np.flatnonzero(counts)
         order = np.lexsort((-ids, -counts[ids]))
         return Overlap(ids[order], counts[ids][order])

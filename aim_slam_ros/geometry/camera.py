@@ -72,8 +72,7 @@ def project(points: Tensor, K: Tensor) -> Tensor:
     return points[..., :2] / z * focal + K[:2, 2]
 
 
-def inside(uv: Tensor, height: int, width: int, border: float = 0.0) -> Tensor:
+def inside(uv: Tensor, height: int, width: int) -> Tensor:
     """[...] bool: which pixels [...,2] lie in the image; nan does not."""
     u, v = uv.unbind(-1)
-    return ((u >= border) & (u <= width - 1 - border)
-            & (v >= border) & (v <= height - 1 - border))
+    return (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)

@@ -31,12 +31,6 @@ class ModelImage:
         K[1, 2] -= self.top_px
         return K
 
-    def K_camera(self, K_model: Tensor) -> Tensor:
-        """The inverse of ``K_model``."""
-        K = K_model.double().clone()
-        K[1, 2] += self.top_px
-        return camera.scaled(K, 1.0 / self.scale_x, 1.0 / self.scale_y)
-
 
 def model_image(image: np.ndarray, width: int) -> ModelImage:
     """image: [H,W,3] uint8 RGB; resized to this width and, where it is higher than wide, cut to

@@ -18,21 +18,19 @@ _FAR_PX = 1e3   # residual charged for a point behind the camera
 class RigidSolution:
     """T_cam_ref: [4,4] float64, rigid.
 
-    inliers: [N] bool. rms_px: of the inliers. kappa: reduced chi-square of the inliers, whitened
-    by the given sigmas, without the robust weights. information: [6,6] float64 in the tangent
-    (translation, rotation), left perturbation of T_cam_ref.
+    inliers: [N] bool. kappa: reduced chi-square of the inliers, whitened by the given sigmas,
+    without the robust weights. information: [6,6] float64 in the tangent (translation, rotation),
+    left perturbation of T_cam_ref.
     """
 
     T_cam_ref: Tensor
     inliers: np.ndarray
-    rms_px: float
     kappa: float
     information: np.ndarray
 
 
 @dataclass(frozen=True)
 class _Linearised:
-    residual: np.ndarray      # [N,2] px
     squared: np.ndarray       # [N] squared Mahalanobis distance
     H: np.ndarray
     g: np.ndarray
@@ -124,7 +122,7 @@ def _linearise(T: np.ndarray, X: np.ndarray, uv: np.ndarray, K: np.ndarray,
     flat = rows.reshape(7, -1)
     equations = (flat[:6] * weight.reshape(-1)) @ flat.T
     cost = _CAUCHY * float(np.log1p(squared / _CAUCHY).sum())
-    return _Linearised(residual, squared, equations[:, :6], equations[:, 6], cost)
+    return _Linearised(squared, equations[:, :6], equations[:, 6], cost)
 
 
 _CAUCHY = 2.0 ** 2      # squared distance, in sigmas, at which a residual counts half
@@ -134,11 +132,9 @@ _INLIER = 3.0 ** 2      # squared distance within which a match counts as explai
 def _solution(T: np.ndarray, final: _Linearised) -> RigidSolution:
     inliers = final.squared < _INLIER
     count = int(inliers.sum())
-    residual = final.residual[inliers]
-    rms = float(np.sqrt((residual ** 2).sum(1).mean())) if count else float('inf')
     freedom = 2 * count - 6
     kappa = float(final.squared[inliers].sum()) / freedom if freedom > 0 else float('inf')
-    return RigidSolution(torch.from_numpy(T), inliers, rms, kappa, final.H)
+    return RigidSolution(torch.from_numpy(T), inliers, kappa, final.H)
 
 
 def _exp_se3(xi: np.ndarray) -> np.ndarray:
