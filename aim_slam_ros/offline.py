@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from aim_slam_ros.config import Config
-from aim_slam_ros.datasets.base import ImageError, Sequence
+from aim_slam_ros.datasets.base import DatasetError, ImageError, Sequence
 from aim_slam_ros.evaluation.run_result import (LoopPair, PlacedKeyframe, RunResult,
                                                 UnreadableImage)
 from aim_slam_ros.frontend.pipeline import FrontendPipeline
@@ -59,8 +59,12 @@ def run(sequence: Sequence, config: Config, indices: Indices[int],
 
     progress: called after each image, with None for an unreadable one. Ctrl-C ends the run: what
     was gathered until then is returned, marked as interrupted. Raises ConfigError for a model that
-    cannot be made and DatasetError for a simulated one without depth and pose of every image.
+    cannot be made and DatasetError where a calibration is to be used and there is none, or a
+    simulated model lacks depth and pose of an image.
     """
+    if config.camera.use_calibration and sequence.K is None:
+        raise DatasetError(sequence.name, 'has no calibration to use',
+                           'add a camera.txt, or leave camera.use_calibration off')
     truth = RecordedTruth(sequence)
     if config.model.name == 'simulated':
         truth.require(indices)

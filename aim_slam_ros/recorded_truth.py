@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Iterable
 
 import numpy as np
@@ -9,10 +10,12 @@ import torch
 from torch import Tensor
 
 from aim_slam_ros.datasets.base import DatasetError, ImageError, Sequence
-from aim_slam_ros.geometry import sim3
+from aim_slam_ros.geometry import camera, sim3
 from aim_slam_ros.models.truth import TrueView
 from aim_slam_ros.types import StampedPoses
 
+_log = logging.getLogger(__name__)
+_PROPORTION = 0.02      # width to height, how far that of depth may be from that of its image
 _MAX_GAP_NS = 100_000_000   # between two true poses, for one between them to be believed
 
 
@@ -21,6 +24,8 @@ class RecordedTruth:
 
     def __init__(self, sequence: Sequence) -> None:
         self._sequence = sequence
+        self._image_size = (0, 0)       # width and height, once they are known
+        self._said = False
 
     def at(self, stamp_ns: int) -> TrueView | None:
         """The truth about the image with exactly this stamp."""
@@ -32,7 +37,7 @@ class RecordedTruth:
         depth = self._depth(index)
         if depth is None or T_world_cam is None or K is None:
             return None
-        return TrueView(depth, torch.from_numpy(K).double(), T_world_cam)
+        return TrueView(depth, self._K_of_depth(torch.from_numpy(K).double(), depth), T_world_cam)
 
     def with_depth(self, indices: Iterable[int]) -> list[int]:
         """Those of the images that have depth and, where the dataset has ground truth, a pose."""
@@ -62,10 +67,45 @@ class RecordedTruth:
             depth = self._sequence.depth(index)
         except ImageError:
             return None
-        if depth is None:
+        if depth is None or not self._belongs(depth, index):
             return None
         known = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0.0))
         return known if known.any() else None
+
+    def _belongs(self, depth: np.ndarray, index: int) -> bool:
+        """Whether it can be the image's, perhaps with fewer pixels: of the same proportions."""
+        (height, width), (image_width, image_height) = depth.shape, self._size_of(index)
+        if not image_width:
+            return True
+        ratio = width * image_height / (height * image_width)
+        if abs(ratio - 1.0) < _PROPORTION:
+            return True
+        if not self._said:
+            self._said = True
+            _log.warning(
+                '%s: depth of %dx%d pixels cannot be that of images of %dx%d; register it to them',
+                self._sequence.name, width, height, image_width, image_height)
+        return False
+
+    def _K_of_depth(self, K: Tensor, depth: np.ndarray) -> Tensor:
+        (height, width), (image_width, image_height) = depth.shape, self._image_size
+        if not image_width or (width, height) == self._image_size:
+            return K
+        return camera.scaled(K, width / image_width, height / image_height)
+
+    def _size_of(self, index: int) -> tuple[int, int]:
+        """Of all images; an unreadable one does not tell it."""
+        if not self._image_size[0]:
+            calibration = self._sequence.calibration
+            if calibration is not None and calibration.width:
+                self._image_size = calibration.width, calibration.height
+            else:
+                try:
+                    height, width = self._sequence.image(index).shape[:2]
+                except ImageError:
+                    return self._image_size
+                self._image_size = width, height
+        return self._image_size
 
 
 def pose_at(poses: StampedPoses, stamp_ns: int) -> Tensor | None:

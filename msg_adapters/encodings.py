@@ -127,11 +127,30 @@ def rgb_from_compressed(msg: Any) -> np.ndarray:
     return bgr if 'compressed rgb' in msg.format else cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
-def K_from_camera_info(msg: Any) -> np.ndarray | None:
+def is_rectified(image_topic: str, msg: Any) -> bool:
+    """Whether a CameraInfo's P holds for the images of this topic, and without distortion.
+
+    image_proc names what it has rectified image_rect or image_rect_color; the camera_info beside
+    it is that of the raw images.
+    """
+    named = any(part.startswith('image_rect') for part in image_topic.split('/'))
+    return named and bool(np.any(_field(msg, 'p')))
+
+
+def published_size(msg: Any) -> tuple[int, int]:
+    """Width and height of the images that a CameraInfo belongs to, binned and cut; 0 unknown."""
+    roi = getattr(msg, 'roi', None)
+    width, height = ((getattr(roi, side, 0) or getattr(msg, side))
+                     // (getattr(msg, f'binning_{axis}', 1) or 1)
+                     for side, axis in (('width', 'x'), ('height', 'y')))
+    return int(width), int(height)
+
+
+def K_from_camera_info(msg: Any, rectified: bool = False) -> np.ndarray | None:
     """[3,3] float64 in pixels of the image as published; None for zeros: not calibrated.
 
     K of the message is that of the full sensor: binning and a region of interest are applied.
-    Raises MessageError for numbers that are not those of a camera.
+    rectified: that of P instead. Raises MessageError for numbers that are not those of a camera.
     """
     values = np.array(_field(msg, 'k'), np.float64)
     if values.shape != (9,):
@@ -139,6 +158,8 @@ def K_from_camera_info(msg: Any) -> np.ndarray | None:
     if not values.any():
         return None
     K = values.reshape(3, 3)
+    if rectified:
+        K = np.array(_field(msg, 'p'), np.float64).reshape(3, 4)[:, :3].copy()
     if not np.isfinite(K).all():
         raise MessageError('K of camera_info holds values that are not finite: calibrate the '
                            'camera, or publish zeros to say that it is not calibrated')
@@ -162,5 +183,5 @@ def has_distortion(msg: Any) -> bool:
 
 
 def _field(msg: Any, name: str) -> Any:
-    """k and d are K and D in ROS 1."""
+    """k, d and p are K, D and P in ROS 1."""
     return getattr(msg, name) if hasattr(msg, name) else getattr(msg, name.upper())

@@ -96,6 +96,15 @@ def test_a_message_without_a_stamp_has_that_of_its_recording(tmp_path: Path) -> 
     assert sequence.stamps_ns.tolist() == [FIRST_NS + i * STEP_NS for i in range(3)]
 
 
+def test_one_message_without_a_stamp_is_left_out(tmp_path: Path) -> None:
+    """A simulator's first image, at 0: the time of its recording is that of another clock."""
+    records = [('/image', FIRST_NS + i, making.image(picture(i), i * STEP_NS)) for i in range(4)]
+    sequence = load_sequence(making.write_ros2(tmp_path / 'bag', records))
+    assert sequence.stamps_ns.tolist() == [STEP_NS, 2 * STEP_NS, 3 * STEP_NS]
+    assert sequence.unreadable_lines == 1
+    np.testing.assert_array_equal(sequence.image(0), picture(1))
+
+
 def test_stamps_that_are_not_newer_are_dropped_and_counted(tmp_path: Path) -> None:
     stamps = [5, 7, 7, 6, 9]
     records = [('/image', 100 + i, making.image(picture(i), stamp))
@@ -182,6 +191,16 @@ def test_poses_that_are_none_are_left_out_and_the_rest_is_sorted(tmp_path: Path)
     path = making.write_ros2(tmp_path / 'none', [*making.images(1), *records[2:]])
     assert '/groundtruth holds no usable pose' in message_of(path)
     assert load_sequence(f'{path}?groundtruth=none').groundtruth is None
+
+
+def test_rectified_images_have_the_camera_of_p_and_no_distortion(tmp_path: Path) -> None:
+    info = making.camera_info(K, D, FIRST_NS)
+    info.p = np.hstack([np.diag([0.5, 0.5, 1.0]) @ K, np.zeros((3, 1))]).reshape(-1)
+    path = making.write_ros2(tmp_path / 'bag', [
+        *making.images(2, '/cam/image_rect_color'), ('/cam/camera_info', FIRST_NS, info)])
+    sequence = load_sequence(path)
+    np.testing.assert_array_equal(sequence.K, np.diag([0.5, 0.5, 1.0]) @ K)
+    assert sequence.distortion is None
 
 
 # What is broken.

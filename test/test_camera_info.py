@@ -9,7 +9,8 @@ import pytest
 from sensor_msgs.msg import CameraInfo, RegionOfInterest
 from wire import as_in_bag, over_wire
 
-from msg_adapters.encodings import K_from_camera_info, has_distortion
+from msg_adapters.encodings import (K_from_camera_info, has_distortion, is_rectified,
+                                    published_size)
 from msg_adapters.errors import MessageError
 from msg_adapters.images import camera_info_msg
 from msg_adapters.stamps import stamp_ns
@@ -69,6 +70,27 @@ def test_bad_intrinsics_are_named(row: int, column: int, value: float, text: str
     msg.k[3 * row + column] = value
     with pytest.raises(MessageError, match=text):
         K_from_camera_info(over_wire(msg))
+
+
+def test_size_of_the_images_as_they_are_published() -> None:
+    msg = camera_info_msg(K, 640, 480, 0, 'cam')
+    assert published_size(over_wire(msg)) == (640, 480)
+    msg.binning_x = msg.binning_y = 2
+    assert published_size(over_wire(msg)) == (320, 240)
+    msg.roi.width, msg.roi.height = 200, 100
+    assert published_size(over_wire(msg)) == (100, 50)
+
+
+def test_p_is_the_camera_of_rectified_images() -> None:
+    msg = camera_info_msg(K, 640, 480, 0, 'cam', [0.2, -0.9, 0.0, 0.0, 1.1])
+    msg.p[0] = msg.p[5] = 400.0
+    read = over_wire(msg)
+    assert is_rectified('/cam/image_rect/compressed', read)
+    assert not is_rectified('/cam/image_raw', read)
+    assert not is_rectified('/cam/image_rect', CameraInfo())
+    found = K_from_camera_info(read, rectified=True)
+    assert found is not None and found[0, 0] == found[1, 1] == 400.0
+    assert found[0, 2] == K[0, 2] and found.shape == (3, 3)
 
 
 def test_too_few_values_are_named() -> None:

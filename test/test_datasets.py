@@ -81,11 +81,15 @@ def test_tum_stamps_are_exact_and_nothing_else_is_needed(tmp_path: Path) -> None
     np.testing.assert_array_equal(sequence.image(1), picture(1))
 
 
-def test_tum_drops_and_counts_stamps_that_are_not_newer(tmp_path: Path) -> None:
-    sequence = load_sequence(tum_folder(tmp_path, ('1.0', '1.0', '0.5', '2.0')))
-    assert sequence.stamps_ns.tolist() == [10**9, 2 * 10**9]
-    assert sequence.dropped_stamps == 2
-    np.testing.assert_array_equal(sequence.image(1), picture(3))
+def test_tum_is_put_in_order_and_one_of_two_equal_stamps_is_left_out(
+        tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Listed as `ls` does it, 99.9 comes after 100.0."""
+    sequence = load_sequence(tum_folder(tmp_path, ('100.0', '100.0', '101.0', '99.9')))
+    assert sequence.stamps_ns.tolist() == [99_900_000_000, 10**11, 101 * 10**9]
+    assert sequence.dropped_stamps == 1
+    for index, listed in enumerate((3, 0, 2)):
+        np.testing.assert_array_equal(sequence.image(index), picture(listed))
+    assert '1 of the listed images are left out' in caplog.text
 
 
 def test_tum_counts_torn_lines(tmp_path: Path) -> None:
@@ -190,6 +194,12 @@ def test_folder_is_sorted_by_number(tmp_path: Path, names: tuple[str, ...],
     assert sequence.stamps_ns.tolist() == stamps_ns
     np.testing.assert_array_equal(sequence.image(0), picture(1))
     np.testing.assert_array_equal(sequence.image(1), picture(0))
+
+
+def test_names_with_decimals_are_times(tmp_path: Path) -> None:
+    for name, stamp_ns in (('12.5', 12_500_000_000), ('1305031102175.304', 1305031102175304000)):
+        save(tmp_path / name / f'{name}.png', picture())
+        assert load_sequence(tmp_path / name).stamps_ns.tolist() == [stamp_ns]
 
 
 def test_folder_drops_two_names_of_one_time(tmp_path: Path) -> None:

@@ -56,6 +56,20 @@ def test_depth_camera_and_pose_of_an_image() -> None:
     assert torch.allclose(truth.T_world_cam, pose(160 * MS), atol=1e-12)
 
 
+def test_depth_with_fewer_pixels_has_a_camera_of_its_own(caplog: pytest.LogCaptureFixture) -> None:
+    class Coarse(Recording):
+        def depth(self, index: int) -> np.ndarray | None:
+            depth = super().depth(index)
+            return None if depth is None else depth[:side, ::2]
+    side = 3
+    truth = RecordedTruth(Coarse()).at(0)
+    assert truth is not None and truth.depth.shape == (3, 4)
+    # the middle of the image, (3.5, 2.5), is the middle of the depth
+    assert truth.K.tolist() == [[25.0, 0.0, 1.5], [0.0, 25.0, 1.0], [0.0, 0.0, 1.0]]
+    side = 2
+    assert RecordedTruth(Coarse()).at(0) is None and 'register it' in caplog.text
+
+
 @pytest.mark.parametrize('stamp_ns', [
     40 * MS, 80 * MS, 120 * MS,     # without depth, torn, empty
     240 * MS,                       # after the last pose

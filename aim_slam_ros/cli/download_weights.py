@@ -34,7 +34,7 @@ class Offer:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit status: 0 done, 2 refused, 130 interrupted (the next call goes on from there)."""
+    """Exit status: 0 done, 2 refused, 130 interrupted."""
     try:
         args = _parser().parse_args(argv)
         return _download(args.repo, args.out.expanduser(), args.yes)
@@ -44,7 +44,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f'download_weights: error: {refusal}', file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print('download_weights: interrupted; call it again to go on from here', file=sys.stderr)
+        print('download_weights: interrupted, the file is not complete: call it again',
+              file=sys.stderr)
         return _INTERRUPTED
 
 
@@ -116,7 +117,7 @@ def _line(error: Exception) -> str:
 
 
 def _room(out: Path, offer: Offer) -> None:
-    """Raises Refusal where the disk cannot hold the file; one begun before counts as nothing."""
+    """Raises Refusal where the disk cannot hold the file; one that is there already needs none."""
     free = shutil.disk_usage(out).free
     if not (out / offer.file).exists() and free < offer.size:
         raise Refusal(f'--out {out}: {free / 1e9:.1f} GB are free, {offer.size / 1e9:.1f} GB are '
@@ -130,7 +131,7 @@ def _agreed() -> bool:
 
 
 def _fetched(hub: ModuleType, offer: Offer, out: Path) -> Path:
-    """The file; the library shows the progress and goes on with what an earlier call began."""
+    """The file; the library shows the progress."""
     errors = hub.errors
     try:
         return Path(hub.hf_hub_download(offer.repo, offer.file, local_dir=out))
@@ -138,8 +139,7 @@ def _fetched(hub: ModuleType, offer: Offer, out: Path) -> Path:
         raise Refusal(f'{offer.url} asks you to accept its licence there, then to log in with '
                       '`hf auth login`') from error
     except (OSError, errors.HTTPError) as error:
-        raise Refusal(f'the download stopped ({_line(error)}); call this again to go on from '
-                      'there') from error
+        raise Refusal(f'the download stopped ({_line(error)}); call this again') from error
 
 
 def _check(path: Path) -> None:

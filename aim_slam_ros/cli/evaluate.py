@@ -42,8 +42,8 @@ def _parser() -> argparse.ArgumentParser:
         epilog='Writes trajectory.txt, keyframes.txt, map.ply, config.yaml, metrics.json and '
                'report.png. Ctrl-C ends the run early and writes what there is.')
     parser.add_argument('dataset', metavar='DATASET',
-                        help='a TUM RGB-D folder, a EuRoC folder, a folder of images, a video, '
-                             'rendered:room or rendered:corridor')
+                        help='a TUM RGB-D folder, a EuRoC folder, a bag, a folder of images, a '
+                             'video, rendered:room or rendered:corridor')
     parser.add_argument('--out', metavar='DIR', type=Path, required=True,
                         help='where the results go; files of an earlier run are replaced')
     parser.add_argument('--model', metavar='M', help='the geometry model (model.name)')

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from aim_slam_ros.datasets.bags import STORE, Bag, BagMessage, header_stamp_ns
 from aim_slam_ros.datasets.base import Calibration, DatasetError
 from aim_slam_ros.geometry import sim3
 from aim_slam_ros.types import StampedPoses
-from msg_adapters.encodings import K_from_camera_info
+from msg_adapters.encodings import K_from_camera_info, is_rectified, published_size
 from msg_adapters.errors import MessageError
 
 # Distortion models of camera_info whose coefficients are those of OpenCV's pinhole camera.
@@ -25,6 +25,7 @@ _PINHOLE_MODELS = ('', 'none', 'plumb_bob', 'rational_polynomial')
 @dataclass(frozen=True)
 class _Pose:
     stamp_ns: int
+    log_ns: int
     position: tuple[float, float, float]
     xyzw: tuple[float, float, float, float]
 
@@ -32,6 +33,9 @@ class _Pose:
 class BagScan:
     """log_ns: of every message of the image topic, as they come. message: the numbers among these
     of the usable ones, stamps_ns: of those; the rest, without a readable header, are ``torn``.
+
+    A topic whose headers all have the stamp 0 has the times of its recording instead; where some
+    have another, those with 0 are torn.
     """
 
     def __init__(self, bag: Bag, topics: ChosenTopics) -> None:
@@ -49,6 +53,7 @@ class BagScan:
             for message in bag.messages([topic.name for topic in topics.all]):
                 self._take(message)
                 bar.update()
+        self._choose_stamps()
         if not self.stamps_ns:
             raise DatasetError(bag.path, f'no message of {topics.image.name} is readable',
                                'record it again, or name another topic with ?topic=TOPIC')
@@ -60,29 +65,45 @@ class BagScan:
             if stamp_ns is None:
                 self.torn += 1
                 return
-            self.stamps_ns.append(stamp_ns or message.log_ns)
+            self.stamps_ns.append(stamp_ns)
             self.message.append(len(self.log_ns) - 1)
         elif message.cdr is not None and stamp_ns is not None:
-            self._take_other(message.topic, stamp_ns or message.log_ns, message.cdr)
+            self._take_other(message, message.cdr, stamp_ns)
 
-    def _take_other(self, topic: str, stamp_ns: int, cdr: bytes) -> None:
+    def _choose_stamps(self) -> None:
+        if any(self.stamps_ns):
+            self.torn += self.stamps_ns.count(0)
+            self.message = [m for m, stamp in zip(self.message, self.stamps_ns) if stamp]
+            self.stamps_ns = [stamp for stamp in self.stamps_ns if stamp]
+        else:
+            self.stamps_ns = [self.log_ns[m] for m in self.message]
+        if any(pose.stamp_ns for pose in self._poses):
+            self._poses = [pose for pose in self._poses if pose.stamp_ns]
+        else:
+            self._poses = [replace(pose, stamp_ns=pose.log_ns) for pose in self._poses]
+
+    def _take_other(self, message: BagMessage, cdr: bytes, stamp_ns: int) -> None:
         camera_info, truth = self._topics.camera_info, self._topics.groundtruth
         try:
-            if camera_info is not None and topic == camera_info.name:
+            if camera_info is not None and message.topic == camera_info.name:
                 if self._camera_info is None:
                     self._camera_info = STORE.deserialize_cdr(cdr, CAMERA_INFO)
             elif truth is not None:
-                self._poses.append(_pose(STORE.deserialize_cdr(cdr, truth.msgtype), stamp_ns))
+                self._poses.append(_pose(STORE.deserialize_cdr(cdr, truth.msgtype),
+                                         stamp_ns, message.log_ns))
         except SerdeError:
             pass    # one of many: the others say the same
 
     def calibration(self) -> Calibration | None:
         """None where there is no camera_info, or it says that the camera is uncalibrated."""
         info = self._camera_info
-        if info is None or info.distortion_model not in _PINHOLE_MODELS:
+        if info is None:
+            return None
+        rectified = is_rectified(self._topics.image.name, info)
+        if not rectified and info.distortion_model not in _PINHOLE_MODELS:
             return None
         try:
-            K = K_from_camera_info(info)
+            K = K_from_camera_info(info, rectified)
         except MessageError as error:
             assert self._topics.camera_info is not None
             raise DatasetError(
@@ -92,8 +113,8 @@ class BagScan:
         if K is None:
             return None
         distortion = np.array(info.d, np.float64)
-        return Calibration(K, distortion if distortion.any() else None,
-                           int(info.width), int(info.height))
+        return Calibration(K, distortion if distortion.any() and not rectified else None,
+                           *published_size(info))
 
     def groundtruth(self) -> StampedPoses | None:
         """In time order; poses that are not finite or lack a rotation are left out."""
@@ -114,11 +135,11 @@ class BagScan:
         return StampedPoses(stamps_ns, poses.numpy())
 
 
-def _pose(message: Any, stamp_ns: int) -> _Pose:
+def _pose(message: Any, stamp_ns: int, log_ns: int) -> _Pose:
     """From PoseStamped, TransformStamped or Odometry."""
     if hasattr(message, 'transform'):
         p, q = message.transform.translation, message.transform.rotation
     else:
         pose = getattr(message.pose, 'pose', message.pose)
         p, q = pose.position, pose.orientation
-    return _Pose(stamp_ns, (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+    return _Pose(stamp_ns, log_ns, (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))

@@ -45,8 +45,8 @@ class Calibration:
 class Sequence(ABC):
     """Images in time order, with what is known about the camera and its path.
 
-    stamps_ns: [N] int64, strictly increasing; ``dropped_stamps`` list entries were not newer than
-    one before them. unreadable_lines: malformed lines left out of the image list.
+    stamps_ns: [N] int64, strictly increasing. Left out of the list of images: ``dropped_stamps``
+    that were not newer than one before them, ``unreadable_lines`` that were malformed.
     groundtruth: camera-to-world, metres, or None. Its stamps are its own, not the images'.
     """
 

@@ -11,13 +11,15 @@ import numpy as np
 from aim_slam_ros.datasets.base import DatasetError, Sequence
 from aim_slam_ros.datasets.calibration import read_camera_file
 from aim_slam_ros.datasets.images import SUFFIXES, check_size, read_image
-from aim_slam_ros.datasets.text import ns_from_seconds, read_tum_trajectory
+from aim_slam_ros.datasets.text import read_tum_trajectory
 
 # The rate assumed for images whose names tell no time.
 FALLBACK_RATE_HZ = 30.0
 _NUMBER = re.compile(r'\d+(?:\.\d+)?')
-# A whole number this large is a Unix time in ns, us or ms; a smaller one is a frame number.
+# A number this large is a Unix time in ns, us or ms; a smaller one is a frame number, or with
+# decimals a time in seconds.
 _EPOCH_UNITS_NS = ((10**17, 1), (10**14, 1_000), (10**11, 1_000_000))
+_SECONDS = (0, 1_000_000_000)
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -64,10 +66,10 @@ def _natural_key(path: Path) -> tuple[tuple[int, Decimal, str], ...]:
 def _stamps_ns(stems: list[str]) -> np.ndarray:
     """[N] int64: times where all names are times, else the order at FALLBACK_RATE_HZ."""
     if all(_NUMBER.fullmatch(stem) for stem in stems):
-        if any('.' in stem for stem in stems):
-            return np.array([ns_from_seconds(stem) for stem in stems], np.int64)
-        smallest = min(int(stem) for stem in stems)
-        for least, unit_ns in _EPOCH_UNITS_NS:
-            if smallest >= least and int(stems[-1]) * unit_ns < 2**63:
-                return np.array([int(stem) * unit_ns for stem in stems], np.int64)
+        numbers = [Decimal(stem) for stem in stems]
+        units = (*_EPOCH_UNITS_NS, _SECONDS) if any('.' in stem for stem in stems) \
+            else _EPOCH_UNITS_NS
+        for least, unit_ns in units:
+            if min(numbers) >= least and max(numbers) * unit_ns < 2**63:
+                return np.array([round(number * unit_ns) for number in numbers], np.int64)
     return np.round(np.arange(len(stems)) * (1e9 / FALLBACK_RATE_HZ)).astype(np.int64)

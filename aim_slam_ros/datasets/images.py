@@ -57,7 +57,10 @@ def _decoded(path: Path, mode: int) -> np.ndarray:
     for start, end in _ENDINGS.items():
         if data.startswith(start) and end not in data[-_PADDING_BYTES:]:
             raise ImageError(path, 'the file is cut short')
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
+    except cv2.error:   # a header that tells an absurd size
+        image = None
     if image is None:
         raise ImageError(path, 'cannot be decoded: no image, or a damaged one')
     return image

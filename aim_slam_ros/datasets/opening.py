@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 from aim_slam_ros.datasets.bag_sequence import BagSequence
@@ -15,6 +16,8 @@ from aim_slam_ros.datasets.rendered import PREFIX, load_rendered
 from aim_slam_ros.datasets.tum import TumSequence
 from aim_slam_ros.datasets.undistort import undistorted
 from aim_slam_ros.datasets.video import VideoSequence
+
+_log = logging.getLogger(__name__)
 
 
 def load_sequence(source: str | Path, *, undistort: bool = False,
@@ -33,7 +36,15 @@ def load_sequence(source: str | Path, *, undistort: bool = False,
         sequence = load_rendered(str(source), cache_dir)
     else:
         sequence = _open(str(source))
+        _say_what_is_left_out(sequence)
     return undistorted(sequence, str(source)) if undistort else sequence
+
+
+def _say_what_is_left_out(sequence: Sequence) -> None:
+    for count, why in ((sequence.dropped_stamps, 'their stamp is not newer than that of one '
+                        'before them'), (sequence.unreadable_lines, 'their entry is damaged')):
+        if count:
+            _log.warning('%s: %d of the listed images are left out: %s', sequence.name, count, why)
 
 
 def _open(source: str) -> Sequence:

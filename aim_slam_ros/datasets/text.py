@@ -25,10 +25,10 @@ class Line:
 
 @dataclass(frozen=True)
 class StampedList:
-    """The readable lines of a stamped list, strictly increasing in time.
+    """The readable lines of a stamped list, in the order of time.
 
-    stamps_ns: [N] int64. values: the other fields of each line. dropped_stamps: lines that were
-    not newer than one before them. unreadable_lines: lines that did not parse.
+    stamps_ns: [N] int64. values: the other fields of each line. dropped_stamps: lines with the
+    stamp of one before them. unreadable_lines: lines that did not parse.
     """
 
     stamps_ns: np.ndarray
@@ -76,7 +76,7 @@ def read_stamped_list(path: Path, form: str, columns: int, separator: str | None
 
     form: the expected line, for the message of the DatasetError raised when none is readable.
     """
-    stamps, values, newest, dropped, unreadable = [], [], None, 0, 0
+    found, dropped, unreadable = dict[int, tuple[str, ...]](), 0, 0
     for line in lines(path, separator):
         try:
             stamp = stamp_ns(line.fields[0])
@@ -84,17 +84,18 @@ def read_stamped_list(path: Path, form: str, columns: int, separator: str | None
             stamp = None
         if stamp is None or len(line.fields) < columns or not all(line.fields[:columns]):
             unreadable += 1
-        elif newest is not None and stamp <= newest:
+        elif stamp in found:
             dropped += 1
         else:
-            newest = stamp
-            stamps.append(stamp)
-            values.append(line.fields[1:])
-    if not stamps:
-        found = f'none of its {unreadable} lines is readable' if unreadable else 'it is empty'
-        raise DatasetError(path, f'{found}; looked for lines "{form}"',
+            found[stamp] = line.fields[1:]
+    if not found:
+        lack = f'none of its {unreadable} lines is readable' if unreadable else 'it is empty'
+        raise DatasetError(path, f'{lack}; looked for lines "{form}"',
                            'restore the file from the dataset')
-    return StampedList(np.array(stamps, np.int64), tuple(values), dropped, unreadable)
+    # Listed as `ls` does it, 99.9 comes after 100.0.
+    stamps = sorted(found)
+    return StampedList(np.array(stamps, np.int64), tuple(found[stamp] for stamp in stamps),
+                       dropped, unreadable)
 
 
 def read_tum_trajectory(path: Path) -> StampedPoses:

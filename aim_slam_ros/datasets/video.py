@@ -18,7 +18,9 @@ class VideoSequence(Sequence):
         """Raises DatasetError."""
         self._path = path
         self._capture = cv2.VideoCapture(str(path))
-        count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) or self._counted()
+        count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        if count <= 0:      # a stream without a header: 0, or something absurd
+            count = self._counted()
         if not self._capture.isOpened() or count <= 0:
             raise DatasetError(path, 'is not a video that OpenCV can open',
                                'name a video file, a folder of images, a TUM RGB-D or a EuRoC '

@@ -14,7 +14,7 @@ class TrueView:
     """What a recording knows of one image.
 
     depth: [h,w] float32 along the optical axis in metres, 0 where unknown; some is known.
-    K: [3,3] float64, pixels of the recorded image. T_world_cam: [4,4] float64, rigid, metres.
+    K: [3,3] float64, pixels of the depth. T_world_cam: [4,4] float64, rigid, metres.
     """
 
     depth: np.ndarray

@@ -17,7 +17,7 @@ from msg_adapters.errors import MessageError
 from ..models import make_model
 from ..models.base import GeometryModel
 from ..types import TrackingStatus
-from .frontend.image_input import CameraInfoInput, ImageInput
+from .frontend.image_input import CameraInfoInput, ImageInput, image_topic
 from .frontend.output import FrontendOutput
 from .frontend.parameters import FrontendParameters
 from .frontend.statistics import FrontendStatistics
@@ -37,7 +37,8 @@ class FrontendNode(Node):
         warn_of_unknown(self, LoopClosureParameters)
         self._statistics = FrontendStatistics()
         output = FrontendOutput(self, parameters)
-        info = CameraInfoInput(self, config.camera.use_calibration)
+        info = CameraInfoInput(self, config.camera.use_calibration,
+                               self.resolve_topic_name(image_topic(parameters)))
         self.model = wrap(make_model(config))
         self._worker = FrontendWorker(config, parameters, self.model, output, self._statistics,
                                       self.get_logger(), info.K)

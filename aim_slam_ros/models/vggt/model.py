@@ -25,8 +25,9 @@ class VggtModel:
 
     One thread works at a time, others wait: a node that begins a new map may still have an
     inference under way, and memory is for one.
-    cached_frames: images whose tokens are kept on the device (each about 8 MB at 518x392); those
-    of others are made again when they are needed. fov_deg: assumed where nothing is known.
+    cached_frames: images whose tokens are kept on the device (each 8.5 to 12.8 MB at a width
+    of 518); those of others are made again when they are needed. fov_deg: assumed where nothing is
+    known.
     """
 
     min_views = 1
@@ -50,9 +51,12 @@ class VggtModel:
 
     def _described(self, tokens: FrameTokens) -> Tensor:
         """[C] float32: the mean patch token, normalised. Of no view's role, so always the same."""
+        patches = None
         try:
             patches = tokens.patches(self._network)
         except torch.OutOfMemoryError:
+            pass    # not in here: the error still holds on to the tensors of the attempt
+        if patches is None:
             self._make_room()
             patches = tokens.patches(self._network)
         self._cache.used(tokens)
@@ -87,7 +91,6 @@ class VggtModel:
             except torch.OutOfMemoryError:
                 if roomy and count == 1:
                     raise
-            # Not in the handler: there the error still holds on to the tensors of the attempt.
             self._make_room()
             count -= roomy
             roomy = True

@@ -13,7 +13,8 @@ from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolic
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from msg_adapters.encodings import K_from_camera_info, has_distortion
+from msg_adapters.encodings import (K_from_camera_info, has_distortion, is_rectified,
+                                    published_size)
 from msg_adapters.errors import MessageError
 
 from .parameters import FrontendParameters
@@ -29,6 +30,11 @@ class ArrivedImage:
     arrived_s: float
 
 
+def image_topic(parameters: FrontendParameters) -> str:
+    """Before remapping."""
+    return 'image/compressed' if parameters.image_transport == 'compressed' else 'image'
+
+
 class ImageInput:
     """Hands every image on at once; says what is wrong while none come."""
 
@@ -38,7 +44,7 @@ class ImageInput:
         self._parameters = parameters
         self._on_image = on_image
         self._compressed = parameters.image_transport == 'compressed'
-        self._topic = 'image/compressed' if self._compressed else 'image'
+        self._topic = image_topic(parameters)
         self._switch = False
         self._last_s = time.monotonic()
         self._silent, self._said = False, ''
@@ -114,10 +120,11 @@ class ImageInput:
 class CameraInfoInput:
     """The camera's intrinsics, where camera_info tells usable ones."""
 
-    def __init__(self, node: Node, used: bool) -> None:
-        """used: whether the settings ask for the calibration."""
+    def __init__(self, node: Node, used: bool, image_topic: str) -> None:
+        """used: whether the settings ask for the calibration. image_topic: whose it is."""
         self._node = node
         self._used = used
+        self._image_topic = image_topic
         self._said: set[str] = set()
         self._K: np.ndarray | None = None
         self._size = (0, 0)
@@ -135,16 +142,17 @@ class CameraInfoInput:
 
     def _take(self, message: CameraInfo) -> None:
         try:
-            self._K = K_from_camera_info(message)
+            rectified = is_rectified(self._image_topic, message)
+            self._K = K_from_camera_info(message, rectified)
         except MessageError as error:
             self._K = None
             self._say(f'camera_info is not used: {error}')
             return
-        self._size = (message.width, message.height)
+        self._size = published_size(message)
         if self._K is not None and not self._used:
             self._say('camera_info has a calibration; it is used when camera.use_calibration is '
                       'set', warn=False)
-        if self._used and has_distortion(message):
+        if self._used and has_distortion(message) and not rectified:
             self._say('the images are distorted and are used as they are: subscribe to rectified '
                       'ones (image_proc) where the distortion is strong')
 
