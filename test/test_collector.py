@@ -261,6 +261,18 @@ def test_only_the_last_session_has_poses(wire: Wire, run: RunResult) -> None:
     assert [r.stamp_ns for r in heard.tracked] == [r.stamp_ns for r in tracked[4:]]
 
 
+def test_a_repeated_stamp_does_not_unplace_its_image(wire: Wire, run: RunResult) -> None:
+    """The bag has it twice; the frontend skips the second."""
+    result = next(r for r in run.results if r.status is TrackingStatus.TRACKED)
+    again = FrameResult(result.stamp_ns, TrackingStatus.SKIPPED, reason='not newer')
+    for answer in (result, again):
+        wire.send('frame', frames.frame_message(
+            FrameReport(SESSION, answer, answer.T_world_cam, 0), 'odom'))
+    wire.heard(frame=2)
+    heard = received_run(wire.collector.topics, Playback({}, 2, False))
+    assert [r.status for r in heard.results] == [TrackingStatus.TRACKED]
+
+
 def test_nothing_heard_is_a_run_too(wire: Wire) -> None:
     heard = received_run(wire.collector.topics, Playback({5: 1}, 1, True))
     figures = metrics.compute(heard, None, NO_TRUTH)

@@ -36,17 +36,17 @@ Break = Callable[[Image], Any]
 class Driver:
     """Feeds one frontend and reads its answers, one for each image."""
 
-    def __init__(self, peer: Peer, process: Process) -> None:
-        self.peer, self.process = peer, process
-        self.rows = peer.hear(PointCloud2, 'frame')
-        self.poses = peer.hear(PoseStamped, 'pose')
-        self.image = peer.publisher(Image, 'image')
-        wait_for(lambda: peer.node.count_publishers('frame'), 'the frontend')
+    def __init__(self, peer: Peer, process: Process, namespace: str = '/') -> None:
+        self.peer, self.process, self.namespace = peer, process, namespace
+        self.rows = peer.hear(PointCloud2, f'{namespace}frame')
+        self.poses = peer.hear(PoseStamped, f'{namespace}pose')
+        self.image = peer.publisher(Image, f'{namespace}image')
+        wait_for(lambda: peer.node.count_publishers(f'{namespace}frame'), 'the frontend')
         self._next_ns = START_NS
 
     def reset(self) -> None:
         """A new map; stamps go on."""
-        assert self.peer.call(Trigger, 'frontend/reset').success
+        assert self.peer.call(Trigger, f'{self.namespace}frontend/reset').success
 
     def stamp(self) -> int:
         self._next_ns += 10 ** 8
@@ -147,6 +147,18 @@ def test_a_duplicate_and_a_late_image_are_skipped(driver: Driver, clip: Clip) ->
     assert driver.answer(message).result.status is TrackingStatus.SKIPPED
 
 
+def test_an_image_without_a_stamp_in_mid_stream_is_skipped(driver: Driver, clip: Clip) -> None:
+    driver.reset()
+    first = driver.send(clip.images[0])
+    message = _image(clip, driver, 1)
+    message.header.stamp = stamp_msg(0)
+    assert driver.answer(message).result.status is TrackingStatus.SKIPPED
+    broken = _image(clip, driver, 1)
+    broken.header.stamp, broken.encoding = stamp_msg(START_NS // 10), 'rgb9'
+    assert driver.answer(broken).result.status is TrackingStatus.SKIPPED
+    assert driver.send(clip.images[2]).session_id == first.session_id, 'no new map begins'
+
+
 def test_a_bag_played_again_begins_a_new_map_and_it_is_said_once(driver: Driver,
                                                                  clip: Clip) -> None:
     driver.reset()
@@ -215,9 +227,14 @@ def test_a_map_is_made_and_told(driver: Driver, clip: Clip) -> None:
 
 def test_a_failing_model_takes_no_pose_from_an_image(tmp_path: Path, clip: Clip) -> None:
     """It is asked about every image; each is followed, and what fails is said, not each time."""
-    with Peer() as peer, Process(tmp_path / 'log', 'failing_frontend', '--ros-args', *SMALL,
-                                 '-p', 'model.infer:=every_image') as process:
-        driver = Driver(peer, process)
+    with Peer() as peer, Process(
+            tmp_path / 'log', 'failing_frontend', '--ros-args', '-r', '__ns:=/failing', *SMALL,
+            '-p', 'model.infer:=every_image') as process:
+        driver = Driver(peer, process, '/failing/')
+
+        def errors(which: str) -> int:
+            own = [m for m in told if m.status[0].name.startswith('/failing')]
+            return int(_values(own[-1], '/failing/')[which]) if own else -1
         told = peer.hear(DiagnosticArray, '/diagnostics')
         index = 0
         while not driver.poses and index < 40:
@@ -227,17 +244,17 @@ def test_a_failing_model_takes_no_pose_from_an_image(tmp_path: Path, clip: Clip)
         process.says('from now on the model fails')
         after = [driver.send(image).result for image in clip.images[index:index + 10]]
         assert [r.status for r in after] == [TrackingStatus.TRACKED] * 10
-        wait_for(lambda: told and int(_values(told[-1])['model_errors']) >= 5, 'the count')
+        wait_for(lambda: errors('model_errors') >= 5, 'the count')
         assert 'the model failed: RuntimeError: another program took the memory' in process.output
         assert process.output.count('the model failed') <= 2
-        assert process.alive and int(_values(told[-1])['errors']) == 0
+        assert process.alive and errors('errors') == 0
         driver.reset()
         first = [driver.send(image).result for image in clip.images[:12]]
         assert {r.status for r in first} == {TrackingStatus.INITIALISING}, 'each is answered'
 
 
-def _values(message: DiagnosticArray) -> dict[str, str]:
-    return values_of(message, '/frontend: tracking')
+def _values(message: DiagnosticArray, namespace: str = '/') -> dict[str, str]:
+    return values_of(message, f'{namespace}frontend: tracking')
 
 
 def _different(tables: list[PointCloud2]) -> int:
@@ -261,6 +278,8 @@ def test_a_topic_that_never_comes_is_said_with_those_that_exist(tmp_path: Path) 
     with Peer() as peer, Process(
             tmp_path / 'log', MODULE, '--ros-args', '-r', 'image:=/nothing', *SMALL,
             '-p', 'image_timeout_s:=1.0') as process:
+        peer.node.create_publisher(CompressedImage, '/camera/jpeg', 1)
+        process.says('-p image_transport:=compressed -r image/compressed:=/camera/jpeg')
         peer.node.create_publisher(Image, '/camera/image_raw', 1)
         process.says('remap with --ros-args -r image:=/camera/image_raw')
         assert 'nobody publishes /nothing' in process.output
@@ -268,9 +287,13 @@ def test_a_topic_that_never_comes_is_said_with_those_that_exist(tmp_path: Path) 
 
 @pytest.mark.parametrize('reliability', ['auto', 'reliable'])
 def test_a_best_effort_camera(tmp_path: Path, clip: Clip, reliability: str) -> None:
-    """auto takes it as it is; reliable can't, and says which parameter to change."""
+    """auto takes it as it is; reliable can't, and says which parameter to change.
+
+    Simulated time that stands still changes nothing.
+    """
     with Peer() as peer, Process(
             tmp_path / 'log', MODULE, '--ros-args', '-r', '__ns:=/best', *SMALL,
+            '-p', 'use_sim_time:=true',
             '-p', f'image_reliability:={reliability}') as process:
         camera = peer.node.create_publisher(Image, '/best/image', BEST_EFFORT)
         rows = peer.hear(PointCloud2, '/best/frame')
@@ -285,6 +308,80 @@ def test_a_best_effort_camera(tmp_path: Path, clip: Clip, reliability: str) -> N
                 break
             time.sleep(0.05)
         assert rows
+
+
+def test_a_calibration_that_does_not_come_is_said(tmp_path: Path, clip: Clip) -> None:
+    """And one of a camera that is best effort, as its images are, is taken."""
+    with Peer() as peer, Process(
+            tmp_path / 'log', MODULE, '--ros-args', '-r', '__ns:=/lacking', *SMALL,
+            '-p', 'camera.use_calibration:=true') as process:
+        driver = Driver(peer, process, '/lacking/')
+        begun = time.monotonic()
+        while time.monotonic() - begun < 2.5:
+            driver.send(clip.images[0])
+            time.sleep(0.1)
+        process.says('nothing comes on /lacking/camera_info')
+        info = images.camera_info_msg(clip.K, *clips.SIZE, START_NS, 'c', [0.1, 0, 0, 0, 0])
+        publisher = peer.node.create_publisher(CameraInfo, '/lacking/camera_info', BEST_EFFORT)
+        wait_for(publisher.get_subscription_count, 'the subscription')
+        publisher.publish(info)
+        process.says('the images are distorted')
+
+
+TF = """
+import os
+from geometry_msgs.msg import TransformStamped
+
+
+class TransformException(Exception):
+    pass
+
+
+class TransformBroadcaster:
+    def __init__(self, node):
+        pass
+
+    def sendTransform(self, transform):
+        print('sent', transform.header.frame_id, transform.child_frame_id, flush=True)
+
+
+class TransformListener:
+    def __init__(self, buffer, node):
+        print('listens', flush=True)
+
+
+class Buffer:
+    def lookup_transform(self, target_frame, source_frame, time):
+        if not os.path.exists('known'):
+            raise TransformException
+        print('asked for', target_frame, source_frame, flush=True)
+        found = TransformStamped()
+        found.transform.rotation.w = 1.0
+        found.transform.translation.z = -0.5
+        return found
+"""
+
+
+def test_odometry_of_a_robot_waits_until_tf_knows_the_camera(tmp_path: Path, clip: Clip) -> None:
+    """A buffer that hears of the camera in odom would forget where on the robot it is."""
+    (tmp_path / 'tf2_ros.py').write_text(TF)
+    with Peer() as peer, Process(
+            tmp_path / 'log', MODULE, '--ros-args', '-r', '__ns:=/robot',
+            '-p', f'camera.width:={clips.WIDTH}', '-p', 'base_frame:=base_link') as process:
+        driver = Driver(peer, process, '/robot/')
+        odometry = peer.hear(Odometry, '/robot/odometry')
+        process.says('listens')      # from the beginning
+        sent = iter(clip.images)
+        while len(driver.poses) < 5:
+            driver.send(next(sent))
+        process.says('TF does not know camera_optical_frame in base_link')
+        assert 'sent' not in process.output and not odometry
+        (tmp_path / 'known').touch()
+        driver.send(next(sent))
+        process.says('sent odom base_link')
+        wait_for(lambda: odometry, 'odometry of the robot')
+        assert odometry[0].child_frame_id == 'base_link'
+        assert 'sent odom camera' not in process.output
 
 
 def test_two_frontends_side_by_side(tmp_path: Path, clip: Clip) -> None:
@@ -302,6 +399,8 @@ def test_two_frontends_side_by_side(tmp_path: Path, clip: Clip) -> None:
             Process(tmp_path / 'right.log', MODULE, *right):
         told = peer.hear(DiagnosticArray, '/diagnostics')
         rows = {side: peer.hear(PointCloud2, f'/{side}/frame') for side in ('left', 'right')}
+        for side in rows:
+            wait_for(lambda: peer.node.count_publishers(f'/{side}/frame'), side)
         cameras = {'left': peer.publisher(Image, '/left/image'),
                    'right': peer.publisher(CompressedImage, '/camera/jpeg')}
         clock = peer.publisher(Clock, '/clock', listeners=1)

@@ -174,6 +174,16 @@ def test_switched_off_it_collects_and_maps_but_asks_nothing() -> None:
     assert len(done.pipeline.fused_map().points) > 1000
 
 
+def test_the_map_is_of_one_piece() -> None:
+    """The other's world is another, with a unit of its own."""
+    events = drifting_events(0.0, piece_from=3)[:5]
+    alone, both = walk(events[:3], enabled=False), walk(events, enabled=False)
+    assert len(set(both.pipeline.pieces.values())) == 2
+    assert np.array_equal(both.pipeline.fused_map().points, alone.pipeline.fused_map().points)
+    other = both.pipeline.fused_map(both.pipeline.pieces[4])
+    assert len(other.points) > 100 and len(other.points) != len(alone.pipeline.fused_map().points)
+
+
 def test_a_loop_joins_two_pieces_in_the_older_world() -> None:
     done = walk(drifting_events(0.0, piece_from=18))
     truth = true_poses(range(len(places())))

@@ -95,6 +95,22 @@ def test_a_callback_that_hangs_does_not_keep_it(start: Start) -> None:
         assert ends_in_time(process, signal.SIGINT) == 0
 
 
+def test_what_a_callback_raises_is_told_and_is_no_success(start: Start) -> None:
+    """Before nodes are closed: two of them may take the time that there is."""
+    make = ('class Slow(Quiet):\n'
+            '    def close(self):\n'
+            '        time.sleep(1.2)\n\n\n'
+            'class Broken(Slow):\n'
+            '    def __init__(self):\n'
+            '        super().__init__("broken")\n'
+            '        self.create_timer(0.3, lambda: 1 / 0)\n\n\n'
+            'def make():\n'
+            '    return [Slow(), Broken()]\n')
+    with start(make) as process:
+        assert process.ended() == 1
+        assert 'ZeroDivisionError' in process.output
+
+
 def test_it_can_be_ended_while_it_is_made(start: Start) -> None:
     """Loading weights takes long."""
     make = 'def make():\n    print("loads", flush=True)\n    time.sleep(60)\n    return Quiet()\n'

@@ -27,6 +27,7 @@ class Probe(Node):
         super().__init__('probe')
         transforms = Transforms(self)
         print('available', transforms.available)
+        transforms.listen()
         T = sim3.exp(torch.tensor([1.0, 2.0, 3.0, 0.1, 0.2, 0.3, 0.0]).double())
         for stamp in (5, 6):
             transforms.send(T, stamp, 'map', 'odom')

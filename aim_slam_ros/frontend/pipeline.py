@@ -68,6 +68,11 @@ class FrontendPipeline:
         return self._map.all
 
     @property
+    def reference_id(self) -> int:
+        """The keyframe that the last image was followed against first; -1 before there is one."""
+        return self._references.main_id
+
+    @property
     def pieces_begun(self) -> int:
         """How many map pieces there have been; loop closure may have joined some since."""
         return self._map.pieces_begun

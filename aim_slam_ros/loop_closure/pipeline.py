@@ -110,9 +110,16 @@ class LoopClosurePipeline:
         loops = {(loop.older, loop.newer) for loop in self._loops}
         return tuple(edge for edge in self._graph.edges if edge not in loops)
 
-    def fused_map(self) -> Cloud:
-        """The corrected world's cloud, in the world's unit."""
-        return self._map.fuse(self._graph.poses())
+    def fused_map(self, piece_id: int | None = None) -> Cloud:
+        """A map piece's cloud, in its world's unit; by default that with most keyframes.
+
+        Unconnected pieces have no common world.
+        """
+        pieces = self.pieces
+        if piece_id is None and pieces:
+            piece_id = Counter(pieces.values()).most_common(1)[0][0]
+        return self._map.fuse({k: T for k, T in self._graph.poses().items()
+                               if pieces[k] == piece_id})
 
     def _show(self, event: KeyframeEvent) -> None:
         self._observations[event.keyframe_id] = event.observations

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Any, Callable
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -47,7 +49,8 @@ class FrontendNode(Node):
         self.create_service(Trigger, '~/resend_keyframes', self._resend_keyframes)
         self.create_service(Trigger, '~/reset', self._reset)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self.create_timer(1.0, self._diagnose)
+        # Not of the node's clock: simulated time may stand still.
+        self.create_timer(1.0, self._diagnose, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(f'model {config.model.name}; waiting for images on '
                                f'{self._images.topic}')
 

@@ -146,7 +146,7 @@ class LoopClosureNode(Node):
         silence_s = self._statistics.silence_s
         if silence_s is None:
             return diagnostics.OK, 'waiting for the frontend'
-        if not self.count_publishers('frame'):
+        if not self.count_publishers(self.resolve_topic_name('frame')):
             return diagnostics.WARN, 'the frontend is gone'
         if silence_s > self._settings.silence_s:
             return diagnostics.WARN, f'nothing came from the frontend for {silence_s:.0f} s'

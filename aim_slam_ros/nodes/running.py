@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import traceback
 from typing import Callable, Protocol, Sequence
 
 import rclpy
@@ -14,6 +15,7 @@ from rclpy.signals import SignalHandlerOptions
 from ..settings import ConfigError
 from .signals import StopSignals
 
+FAILED = 1              # exit status where a callback raised
 WRONG_USE = 2           # exit status for a wrong setting, as of a wrong command line
 _LOOK_UP_S = 0.1        # how often spinning looks whether it was told to stop
 
@@ -36,13 +38,14 @@ def run(make_nodes: MakeNodes, argv: list[str] | None = None) -> int:
 
     To be called once, by the main thread, right before the process ends. SIGINT and SIGTERM end
     it; a second one changes nothing. A ConfigError from ``make_nodes`` is one line on stderr and
-    status 2. A thread that does not end in time ends with the process.
+    status 2; what a callback raises is a traceback there and status 1. A thread that does not end
+    in time ends with the process.
     """
     stop = StopSignals()
     threads_before = set(threading.enumerate())
     status = 0
     try:
-        _live(make_nodes, argv, stop)
+        status = _live(make_nodes, argv, stop)
     except (ConfigError, ParameterException) as error:
         print(f'error: {error}', file=sys.stderr)
         status = WRONG_USE
@@ -73,21 +76,29 @@ def _made(make_nodes: MakeNodes) -> ClosableNode | Sequence[ClosableNode]:
         raise
 
 
-def _live(make_nodes: MakeNodes, argv: list[str] | None, stop: StopSignals) -> None:
+def _live(make_nodes: MakeNodes, argv: list[str] | None, stop: StopSignals) -> int:
+    """The exit status: FAILED where a callback raised, which is said before anything is closed."""
     with stop.interrupting():
         _init(argv)
         made = _made(make_nodes)
     nodes = list(made) if isinstance(made, Sequence) else [made]
     executor = SingleThreadedExecutor()
+    status = 0
     try:
         for node in nodes:
             executor.add_node(node)  # type: ignore[arg-type]
         while not stop.told:
             executor.spin_once(timeout_sec=_LOOK_UP_S)
+    except (ExternalShutdownException, ROSInterruptException):
+        raise
+    except Exception:
+        status = FAILED
+        traceback.print_exc()
     finally:
-        stop.end()
+        stop.end(status)
         for node in nodes:
             node.close()
         executor.shutdown(timeout_sec=0)
         for node in nodes:
             node.destroy_node()
+    return status

@@ -42,16 +42,19 @@ class Transforms:
             self._broadcaster = tf2_ros.TransformBroadcaster(self._node)
         self._broadcaster.sendTransform(poses.transform(T_parent_child, stamp_ns, parent, child))
 
+    def listen(self) -> None:
+        """Begin to collect what others broadcast."""
+        if self._usable() and self._buffer is None:
+            self._buffer = tf2_ros.Buffer()
+            self._listener = tf2_ros.TransformListener(self._buffer, self._node)
+
     def lookup(self, parent: str, child: str) -> Tensor | None:
         """The newest T_parent_child [4,4] float64; None while TF does not know it.
 
-        The first call begins to listen: ask again later.
+        Only what was broadcast since ``listen`` is known, and before that for ever.
         """
-        if not self._usable():
-            return None
         if self._buffer is None:
-            self._buffer = tf2_ros.Buffer()
-            self._listener = tf2_ros.TransformListener(self._buffer, self._node)
+            return None
         try:
             found = self._buffer.lookup_transform(parent, child, Time()).transform
         except tf2_ros.TransformException:

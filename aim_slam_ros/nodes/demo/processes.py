@@ -17,7 +17,7 @@ import aim_slam_ros
 _PACKAGE = 'aim_slam_ros'
 _LIBC = ctypes.CDLL(None)
 _PR_SET_PDEATHSIG = 1
-# A node gives itself 3 s to end; the rest is for the interpreter on a machine that is busy.
+# A node gives itself 2 s to end; the rest is for the interpreter on a machine that is busy.
 _GRACE_S = 5.0
 _TAIL_LINES = 12
 _CLEAN = (0, 128 + signal.SIGINT, -signal.SIGINT)

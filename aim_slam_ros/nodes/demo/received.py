@@ -96,7 +96,12 @@ class FrameRows:
 
 
 def _later(before: FrameResult, after: FrameResult) -> FrameResult:
-    """The later result with what the image cost in all: a stage is told when it is over."""
+    """The later result with what the image cost in all: a stage is told when it is over.
+
+    A skipped one is another image with the same stamp.
+    """
+    if after.status is TrackingStatus.SKIPPED:
+        return before
     names = dict.fromkeys((*before.stage_s, *after.stage_s))
     return replace(
         after, inferences=max(before.inferences, after.inferences),

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import Any, Callable
 
 import numpy as np
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
@@ -19,6 +21,7 @@ from msg_adapters.errors import MessageError
 
 from .parameters import FrontendParameters
 
+_CAMERA_INFO_S = 2.0    # images without it for so long are said
 _LOOK_S = 0.2    # how often it is looked whether something is amiss
 
 
@@ -49,7 +52,7 @@ class ImageInput:
         self._last_s = time.monotonic()
         self._silent, self._said = False, ''
         self._subscribe(parameters.image_reliability != 'best_effort')
-        node.create_timer(_LOOK_S, self._look)
+        node.create_timer(_LOOK_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     @property
     def topic(self) -> str:
@@ -108,13 +111,26 @@ class ImageInput:
         topic = self._subscription.topic_name
         if self._node.count_publishers(topic):
             return f'{topic} has a publisher that sends nothing (or nothing that arrives)'
-        wanted = 'sensor_msgs/msg/' + ('CompressedImage' if self._compressed else 'Image')
-        found = sorted(name for name, types in self._node.get_topic_names_and_types()
-                       if wanted in types and name != topic and self._node.count_publishers(name))
-        there = f'{wanted} is published on {", ".join(found)}: remap with ' \
-            f'--ros-args -r {self._topic}:={found[0]}' if found else \
-            f'nobody publishes {wanted}: start a camera driver or play a bag'
+        kinds = ['sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage']
+        wanted, other = reversed(kinds) if self._compressed else kinds
+        found, others = self._published(wanted), self._published(other)
+        if found:
+            there = f'{wanted} is published on {", ".join(found)}: remap with --ros-args ' \
+                f'-r {self._topic}:={found[0]}'
+        elif others:
+            transport, name = ('raw', 'image') if self._compressed else (
+                'compressed', 'image/compressed')
+            there = f'only {other} is published, on {", ".join(others)}: take it with ' \
+                f'--ros-args -p image_transport:={transport} -r {name}:={others[0]}'
+        else:
+            there = f'nobody publishes {wanted}: start a camera driver or play a bag'
         return f'nobody publishes {topic}; {there}'
+
+    def _published(self, kind: str) -> list[str]:
+        """Other topics of this type that somebody publishes."""
+        return sorted(name for name, types in self._node.get_topic_names_and_types()
+                      if kind in types and name != self._subscription.topic_name
+                      and self._node.count_publishers(name))
 
 
 class CameraInfoInput:
@@ -126,21 +142,36 @@ class CameraInfoInput:
         self._used = used
         self._image_topic = image_topic
         self._said: set[str] = set()
+        self._came = False
         self._K: np.ndarray | None = None
         self._size = (0, 0)
-        node.create_subscription(CameraInfo, 'camera_info', self._take, 1,
-                                 qos_overriding_options=QoSOverridingOptions
-                                 .with_default_policies())
+        self._begun_s: float | None = None
+        # Best effort matches every publisher, and one that is lost comes again.
+        self._subscription = node.create_subscription(
+            CameraInfo, 'camera_info', self._take,
+            QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
     def K(self, width: int, height: int) -> np.ndarray | None:
         """[3,3] pixels of an image of this size; None where the camera is uncalibrated."""
+        if self._used and not self._came:
+            self._say_that_none_comes()
         if self._K is not None and self._size not in ((width, height), (0, 0)):
             self._say(f'camera_info is for images of {self._size[0]}x{self._size[1]} pixels, '
                       f'these have {width}x{height}: it is not used')
             return None
         return self._K
 
+    def _say_that_none_comes(self) -> None:
+        now = time.monotonic()
+        self._begun_s = now if self._begun_s is None else self._begun_s
+        if now - self._begun_s > _CAMERA_INFO_S:
+            self._say(f'camera.use_calibration is set, but nothing comes on '
+                      f'{self._subscription.topic_name}: the focal length is guessed; remap with '
+                      '--ros-args -r camera_info:=TOPIC, or call ~/reset once it comes')
+
     def _take(self, message: CameraInfo) -> None:
+        self._came = True
         try:
             rectified = is_rectified(self._image_topic, message)
             self._K = K_from_camera_info(message, rectified)

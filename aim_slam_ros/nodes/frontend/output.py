@@ -37,6 +37,8 @@ class FrontendOutput:
         self._keyframe = self._publisher(PointCloud2, 'keyframe', 20)
         self._keyframe_cloud = self._publisher(PointCloud2, 'keyframe_cloud', 20)
         self._transforms = Transforms(node)
+        if parameters.base_frame:
+            self._transforms.listen()
         self._base_unknown = False
         self._last_ns = -1
         self.camera_frame = parameters.camera_frame or _NO_FRAME
@@ -83,14 +85,21 @@ class FrontendOutput:
         odom = self._parameters.odom_frame
         T_odom_camera = poses.T_ZUP_OPTICAL @ T_odom_cam
         self._pose.publish(poses.pose_stamped(T_odom_camera, stamp_ns, odom))
-        T_camera_child, child = self._child()
+        found = self._child()
+        if found is None:
+            return
+        T_camera_child, child = found
         T_odom_child = T_odom_camera @ T_camera_child
         self._odometry.publish(poses.odometry(T_odom_child, stamp_ns, odom, child))
         if self._parameters.publish_tf:
             self._transforms.send(T_odom_child, stamp_ns, odom, child)
 
-    def _child(self) -> tuple[Tensor, str]:
-        """The frame that odometry is of, seen from the camera: the robot's, where TF knows it."""
+    def _child(self) -> tuple[Tensor, str] | None:
+        """The frame that odometry and TF are of, seen from the camera; None while it is unknown.
+
+        The camera itself is no substitute: a robot's TF that once hears of its camera in odom
+        forgets where on the robot it is.
+        """
         base = self._parameters.base_frame
         if base and base != self.camera_frame:
             T_camera_base = self._transforms.lookup(self.camera_frame, base)
@@ -100,9 +109,10 @@ class FrontendOutput:
             if not self._base_unknown:
                 self._base_unknown = True
                 self._node.get_logger().warning(
-                    f'TF does not know {self.camera_frame} in {base}: odometry is of the camera '
-                    'until it does; publish that transform (robot_state_publisher, '
+                    f'TF does not know {self.camera_frame} in {base}: there is no odometry and no '
+                    'TF until it does; publish that transform (robot_state_publisher, '
                     'static_transform_publisher)')
+            return None
         return sim3.identity(), self.camera_frame
 
     def _publish_points(self, event: KeyframeEvent, T_odom_world: Tensor) -> None:

@@ -145,7 +145,11 @@ class FrontendWorker:
         if received is not None:
             self._take_correction(received)
         if resend:
-            self._resending = deque(k.keyframe_id for k in self._frontend.pipeline.keyframes)
+            # First the one that images refer to now: by it they are placed in the map.
+            newest = self._frontend.pipeline.reference_id
+            self._resending = deque(sorted(
+                (k.keyframe_id for k in self._frontend.pipeline.keyframes),
+                key=lambda i: (i != newest, i)))
         self._collect()
         if image is not None:
             self._take_image(image)
@@ -179,13 +183,6 @@ class FrontendWorker:
     def _take_image(self, arrived: ArrivedImage) -> None:
         stamp = stamp_ns(arrived.message.header.stamp)
         self._output.saw_frame_id(arrived.message.header.frame_id)
-        if stamp < self._last_ns - _BACKWARDS_NS:
-            self._logger.warning(
-                f'time went back by {(self._last_ns - stamp) / 1e9:.1f} s (a bag played again?): '
-                'a new map begins')
-            self._restart()
-        self._last_ns = max(self._last_ns, stamp)
-        self._arrived_s[stamp] = arrived.arrived_s
         try:
             if stamp <= 0:
                 raise MessageError('header.stamp is 0: the driver must set it')
@@ -194,6 +191,13 @@ class FrontendWorker:
             skipped = FrameResult(stamp, TrackingStatus.SKIPPED, reason=str(error))
             self._publish([self._frontend.unplaced(skipped)])
             return
+        if stamp < self._last_ns - _BACKWARDS_NS:
+            self._logger.warning(
+                f'time went back by {(self._last_ns - stamp) / 1e9:.1f} s (a bag played again?): '
+                'a new map begins')
+            self._restart()
+        self._last_ns = max(self._last_ns, stamp)
+        self._arrived_s[stamp] = arrived.arrived_s
         height, width = image.shape[:2]
         self._publish(self._frontend.process(stamp, image, self._K_of(width, height)))
 

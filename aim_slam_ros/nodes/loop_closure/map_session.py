@@ -23,7 +23,8 @@ class MapSession:
     """Frames and keyframes with the same session id.
 
     Two threads: the callbacks' places frames, the worker's adds keyframes and asks for what
-    follows from them. Between them stands ``_T_world_kf``, which the worker replaces as a whole.
+    follows from them. Between them stand ``_T_world_kf`` and ``_T_map_kf``, which the worker
+    replaces as a whole. The map is the piece with most frames: others have no place in it yet.
     """
 
     def __init__(self, session_id: int, config: Config, model: GeometryModel, gap_s: float,
@@ -36,6 +37,7 @@ class MapSession:
         self._pipeline = LoopClosurePipeline(config, model)
         self._from_odom = MapFromOdom()
         self._T_world_kf: Mapping[int, Tensor] = {}
+        self._T_map_kf: Mapping[int, Tensor] = {}
         self._pieces = 0
         self._stamps_ns: dict[int, int] = {}
 
@@ -62,7 +64,7 @@ class MapSession:
     def place(self, report: FrameReport) -> Tensor | None:
         """T_map_cam [4,4] float64, rigid, of a tracked frame; None of another.
 
-        Where the keyframe is not in the map yet, odom's last known place in the map decides.
+        Where the keyframe is not in the map (yet), odom's last known place in the map decides.
         """
         result, T_odom_cam = report.result, report.T_odom_cam
         if result.reference_id is not None:
@@ -72,10 +74,10 @@ class MapSession:
         if result.reference_id is None or result.T_kf_cam is None:
             return self._from_odom.place(T_odom_cam)
         self.path.add(result.stamp_ns, result.reference_id, result.T_kf_cam)
-        T_world_kf = self._T_world_kf.get(result.reference_id)
-        if T_world_kf is None:
+        T_map_kf = self._T_map_kf.get(result.reference_id)
+        if T_map_kf is None:
             return self._from_odom.place(T_odom_cam)
-        return self._from_odom.learn(result.reference_id, T_world_kf, result.T_kf_cam, T_odom_cam)
+        return self._from_odom.learn(result.reference_id, T_map_kf, result.T_kf_cam, T_odom_cam)
 
     def knows(self, keyframe_id: int) -> bool:
         return keyframe_id in self._T_world_kf
@@ -90,8 +92,10 @@ class MapSession:
         try:
             return self._pipeline.add(event)
         finally:
+            pieces, piece = self._pipeline.pieces, self._piece()
             self._T_world_kf = {p.keyframe_id: p.T_world_kf for p in self._pipeline.poses}
-            self._pieces = len(set(self._pipeline.pieces.values()))
+            self._T_map_kf = {k: T for k, T in self._T_world_kf.items() if pieces[k] == piece}
+            self._pieces = len(set(pieces.values()))
 
     def trajectory(self) -> StampedPoses:
         """Every frame of the largest connected piece, corrected."""
@@ -99,10 +103,7 @@ class MapSession:
 
     def keyframe_trajectory(self) -> StampedPoses:
         """The keyframes of the same piece by their stamps, without their scales."""
-        pieces = self._pipeline.pieces
-        piece = self.path.largest_piece(pieces)
-        if piece is None:       # no frame has come since this node was started
-            piece, = (p for p, _ in Counter(pieces.values()).most_common(1))
+        pieces, piece = self._pipeline.pieces, self._piece()
         ids = sorted((k for k in self._T_world_kf if pieces[k] == piece),
                      key=self._stamps_ns.__getitem__)
         poses = torch.stack([self._T_world_kf[k] for k in ids])
@@ -111,4 +112,12 @@ class MapSession:
 
     def cloud(self) -> Cloud:
         """The fused map, in the world's unit."""
-        return self._pipeline.fused_map()
+        return self._pipeline.fused_map(self._piece())
+
+    def _piece(self) -> int | None:
+        """Which piece the map is; None before the first keyframe."""
+        pieces = self._pipeline.pieces
+        piece = self.path.largest_piece(pieces)
+        if piece is None and pieces:    # no frame has come since this node was started
+            piece = Counter(pieces.values()).most_common(1)[0][0]
+        return piece

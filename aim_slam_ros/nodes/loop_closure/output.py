@@ -17,11 +17,14 @@ from msg_adapters import clouds, keyframes, markers, poses
 from msg_adapters.serialised_path import serialised_path
 
 from ...geometry import sim3
-from ...types import CorrectedKeyframes
+from ...types import CorrectedKeyframes, StampedPoses
 from ..transforms import Transforms
 from .map_files import z_up, z_up_cloud
 from .map_session import MapSession
 from .parameters import LoopClosureParameters
+
+
+_PATH_POSES = 10_000     # a message of .7 MB; a whole day would be 190
 
 
 class LoopClosureOutput:
@@ -68,8 +71,8 @@ class LoopClosureOutput:
             max(stamps_ns.values())))
 
     def path(self, session: MapSession) -> None:
-        """Every image of the largest piece."""
-        trajectory = z_up(session.trajectory())
+        """Every image of the largest piece; of a long run every n-th, and the newest."""
+        trajectory = z_up(_thinned(session.trajectory()))
         self._path.publish(serialised_path(trajectory.stamps_ns, trajectory.T_world_cam,
                                            self._parameters.map_frame))
 
@@ -88,3 +91,11 @@ class LoopClosureOutput:
         return self._node.create_publisher(
             kind, topic, qos,
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
+
+
+def _thinned(trajectory: StampedPoses) -> StampedPoses:
+    step = -(-len(trajectory) // _PATH_POSES)
+    if step <= 1:
+        return trajectory
+    rows = slice((len(trajectory) - 1) % step, None, step)     # the newest is the last one
+    return StampedPoses(trajectory.stamps_ns[rows], trajectory.T_world_cam[rows])
