@@ -57,8 +57,9 @@ def run(sequence: Sequence, config: Config, indices: Indices[int],
         ) -> RunResult:
     """Process these images of the sequence, every one of them.
 
-    progress: called after each image, with None for an unreadable one. Ctrl-C ends the run: what
-    was gathered until then is returned, marked as interrupted. Raises ConfigError for a model that
+    progress: called after each image, with None for an unreadable one. Ctrl-C ends the run, and so
+    does what the frontend or the model raises once there are results: what was gathered until then
+    is returned, marked as interrupted. Raises ConfigError for a model that
     cannot be made and DatasetError where a calibration is to be used and there is none, or a
     simulated model lacks depth and pose of an image.
     """
@@ -100,6 +101,11 @@ class _Run:
                 progress(self._step(index))
         except KeyboardInterrupt:
             interrupted = True
+        except Exception:
+            if not self._results:
+                raise
+            _log.exception('the run ends here, after %d images', len(self._results))
+            interrupted = True
         return self._result(time.perf_counter() - start, interrupted)
 
     def _step(self, index: int) -> FrameResult | None:
@@ -121,7 +127,7 @@ class _Run:
         return result
 
     def _loop_closed(self, event: KeyframeEvent) -> CorrectedKeyframes | None:
-        """As the node does it: one keyframe must not end the run."""
+        """A keyframe with unusable numbers must not end the run."""
         with self._timed('loop_closure'):
             try:
                 return self._loop_closure.add(event)

@@ -196,6 +196,27 @@ def test_a_keyframe_of_nonsense_does_not_end_a_run(
     assert any('keyframe 1 is not used' in message for message in caplog.messages)
 
 
+def test_a_model_that_fails_late_leaves_what_there_was(
+        room: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Out of memory at the last of many images: the others are a result."""
+    class Failing(FrontendPipeline):
+        def process(self, stamp_ns: int, image: np.ndarray,
+                    K: np.ndarray | None = None) -> FrameResult:
+            if len(done) == left:
+                raise RuntimeError('out of memory')
+            done.append(stamp_ns)
+            return super().process(stamp_ns, image, K)
+
+    sequence, done, left = load_sequence(room), list[int](), 5
+    config = Config().with_values({'camera.width': '280'})
+    run = offline.run(sequence, config, range(len(sequence)), make_frontend=Failing)
+    assert run.interrupted and len(run.results) == 5
+    assert 'after 5 images' in caplog.text and 'out of memory' in caplog.text
+    done, left = [], 0
+    with pytest.raises(RuntimeError, match='out of memory'):
+        offline.run(sequence, config, range(len(sequence)), make_frontend=Failing)
+
+
 def test_both_baselines_follow_a_model_that_is_right(clip: Clip) -> None:
     """Through the unit of every window. The depths of two inferences differ by float32 only."""
     config = Config().with_values(CALIBRATED)

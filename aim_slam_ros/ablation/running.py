@@ -28,7 +28,8 @@ def limit_threads(threads: int) -> None:
 
 
 def figures_of(run: Run) -> Mapping[str, Metric]:
-    """Raises ConfigError and DatasetError as offline.run and load_sequence do.
+    """Raises ConfigError and DatasetError as offline.run and load_sequence do, RuntimeError for a
+    run that did not come to its end.
 
     The baselines are the geometry model's own poses: no loop is closed for them.
     """
@@ -38,4 +39,6 @@ def figures_of(run: Run) -> Mapping[str, Metric]:
     sequence = load_sequence(run.images.source, undistort=run.images.undistort)
     result = offline.run(sequence, config, run.images.indices,
                          make_frontend=_FRONTENDS[run.method])
+    if result.interrupted:
+        raise RuntimeError('the run did not come to its end')
     return assess(result, sequence, config).figures

@@ -20,7 +20,7 @@ _INTERRUPTED = 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit status: 0 done, 2 refused, 130 interrupted (with everything until then written)."""
+    """Exit status: 0 done, 2 refused, 130 interrupted or failed, what there was being written."""
     try:
         args = _parser().parse_args(argv)
         config = configured(_assignments(args))
