@@ -39,3 +39,16 @@ def test_few_wait_and_the_oldest_are_given_up() -> None:
         assert pairs.table(message(second)) is None
     assert pairs.unpaired == 90
     assert pairs.cloud(message(89)) is None and pairs.cloud(message(90)) is not None
+
+
+def test_what_an_earlier_telling_left_over_is_not_of_a_later_one() -> None:
+    """The first cloud was lost; the keyframe is told again, the cloud first."""
+    now = [0.0]
+    pairs = KeyframePairs(lambda: now[0])
+    assert pairs.table(message(1)) is None
+    now[0] = 20.0
+    cloud, table = message(1), message(1)
+    assert pairs.cloud(cloud) is None and pairs.unpaired == 1
+    now[0] = 20.1
+    found = pairs.table(table)
+    assert found is not None and found.table is table and found.cloud is cloud

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Callable
 
 from msg_adapters.stamps import stamp_ns
 
 _WAITING = 10       # of each kind; some megabytes each
+_TOGETHER_S = 5.0   # two that belong together come within; else one of an earlier pair was lost
 
 
 @dataclass(frozen=True)
@@ -16,12 +18,22 @@ class KeyframePair:
     cloud: Any
 
 
-class KeyframePairs:
-    """Brings tables and clouds together by their stamps."""
+@dataclass(frozen=True)
+class _Waiting:
+    message: Any
+    since_s: float
 
-    def __init__(self) -> None:
-        self._tables: dict[int, Any] = {}
-        self._clouds: dict[int, Any] = {}
+
+class KeyframePairs:
+    """Brings tables and clouds together by their stamps.
+
+    A keyframe is told more than once: what waits too long is not of the same time as what comes.
+    """
+
+    def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._clock_s = clock_s
+        self._tables: dict[int, _Waiting] = {}
+        self._clouds: dict[int, _Waiting] = {}
         self.unpaired = 0       # messages given up because their counterpart never came
 
     def table(self, message: Any) -> KeyframePair | None:
@@ -34,13 +46,16 @@ class KeyframePairs:
         table = self._match(message, self._clouds, self._tables)
         return None if table is None else KeyframePair(table, message)
 
-    def _match(self, message: Any, own: dict[int, Any], other: dict[int, Any]) -> Any:
-        stamp = stamp_ns(message.header.stamp)
+    def _match(self, message: Any, own: dict[int, _Waiting],
+               other: dict[int, _Waiting]) -> Any:
+        stamp, now_s = stamp_ns(message.header.stamp), self._clock_s()
         found = other.pop(stamp, None)
-        if found is None:
-            own.pop(stamp, None)        # a resent one takes the place of the first
-            own[stamp] = message
-            if len(own) > _WAITING:
-                own.pop(next(iter(own)))
-                self.unpaired += 1
-        return found
+        if found is not None and now_s - found.since_s <= _TOGETHER_S:
+            return found.message
+        self.unpaired += found is not None
+        own.pop(stamp, None)        # a resent one takes the place of the first
+        own[stamp] = _Waiting(message, now_s)
+        if len(own) > _WAITING:
+            own.pop(next(iter(own)))
+            self.unpaired += 1
+        return None
