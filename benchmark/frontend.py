@@ -49,6 +49,7 @@ VIEWS = (3, 5)
 MODEL_STAGES = ('encode', 'infer')
 MAP_SIZES = (500, 2000)
 ROOM_KEYFRAMES = 50     # of one room of the building
+FEWEST = 60             # images, for windows to become full
 STEPS = 12              # keyframes of the map that single stages are measured on
 REPEAT = 15
 MEMORY_KEYFRAMES = 60
@@ -112,6 +113,8 @@ def main() -> int:
     args = arguments.parse_args()
     sequence = load_sequence('rendered:room')
     count = min(args.images, len(sequence))
+    if count < FEWEST:
+        arguments.error(f'--images {args.images}: at least {FEWEST}')
     inputs = Inputs([int(s) for s in sequence.stamps_ns[:count]],
                     [sequence.image(i) for i in range(count)], KnownGeometry(sequence, count))
     # Memory first: later there is freed memory that would be used again.

@@ -278,11 +278,17 @@ def test_a_topic_that_never_comes_is_said_with_those_that_exist(tmp_path: Path) 
     with Peer() as peer, Process(
             tmp_path / 'log', MODULE, '--ros-args', '-r', 'image:=/nothing', *SMALL,
             '-p', 'image_timeout_s:=1.0') as process:
-        peer.node.create_publisher(CompressedImage, '/camera/jpeg', 1)
-        process.says('-p image_transport:=compressed -r image/compressed:=/camera/jpeg')
         peer.node.create_publisher(Image, '/camera/image_raw', 1)
         process.says('remap with --ros-args -r image:=/camera/image_raw')
         assert 'nobody publishes /nothing' in process.output
+
+
+def test_a_topic_of_the_other_transport_is_said(tmp_path: Path) -> None:
+    with Peer() as peer, Process(
+            tmp_path / 'log', MODULE, '--ros-args', '-r', 'image/compressed:=/nothing', *SMALL,
+            '-p', 'image_timeout_s:=1.0', '-p', 'image_transport:=compressed') as process:
+        peer.node.create_publisher(Image, '/camera/image_raw', 1)
+        process.says('take it with --ros-args -p image_transport:=raw -r image:=/camera/image_raw')
 
 
 @pytest.mark.parametrize('reliability', ['auto', 'reliable'])
