@@ -196,6 +196,15 @@ def test_folder_is_sorted_by_number(tmp_path: Path, names: tuple[str, ...],
     np.testing.assert_array_equal(sequence.image(1), picture(0))
 
 
+def test_a_video_without_a_frame_count_is_counted(tmp_path: Path) -> None:
+    """A raw stream of JPEGs has no header that could tell."""
+    path = tmp_path / 'camera.mjpeg'
+    path.write_bytes(b''.join(cv2.imencode('.jpg', picture(i))[1].tobytes() for i in range(4)))
+    sequence = load_sequence(path)
+    assert len(sequence) == 4
+    assert sequence.image(3).shape == picture(3).shape
+
+
 def test_names_with_decimals_are_times(tmp_path: Path) -> None:
     for name, stamp_ns in (('12.5', 12_500_000_000), ('1305031102175.304', 1305031102175304000)):
         save(tmp_path / name / f'{name}.png', picture())
