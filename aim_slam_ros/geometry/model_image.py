@@ -44,5 +44,5 @@ def model_image(image: np.ndarray, width: int) -> ModelImage:
     resized = F.interpolate(channels, (height, width), mode='bicubic', antialias=True)
     top = max(0, height - width) // 2
     cut = resized[0, :, top:top + width].permute(1, 2, 0).numpy()
-    # A copy: with torch's own memory a map of 15 keyframes held 370 MB more (benchmark/memory.py).
+    # A copy: a view would keep torch's memory, what was cut away included.
     return ModelImage(cut.copy(), width / image.shape[1], height / image.shape[0], top)

@@ -100,6 +100,12 @@ class LoopClosurePipeline:
         return {k: self._piece_ids[root] for k, root in self._graph.components.items()}
 
     @property
+    def largest_piece(self) -> int | None:
+        """The piece with most keyframes; None before the first."""
+        most = Counter(self.pieces.values()).most_common(1)
+        return most[0][0] if most else None
+
+    @property
     def version(self) -> int:
         """How many corrections there have been."""
         return self._version
@@ -116,8 +122,8 @@ class LoopClosurePipeline:
         Unconnected pieces have no common world.
         """
         pieces = self.pieces
-        if piece_id is None and pieces:
-            piece_id = Counter(pieces.values()).most_common(1)[0][0]
+        if piece_id is None:
+            piece_id = self.largest_piece
         return self._map.fuse({k: T for k, T in self._graph.poses().items()
                                if pieces[k] == piece_id})
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import Mapping
 
 import numpy as np
@@ -116,8 +115,6 @@ class MapSession:
 
     def _piece(self) -> int | None:
         """Which piece the map is; None before the first keyframe."""
-        pieces = self._pipeline.pieces
-        piece = self.path.largest_piece(pieces)
-        if piece is None and pieces:    # no frame has come since this node was started
-            piece = Counter(pieces.values()).most_common(1)[0][0]
-        return piece
+        piece = self.path.largest_piece(self._pipeline.pieces)
+        # No frame may have come since this node was started.
+        return self._pipeline.largest_piece if piece is None else piece
