@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Callable, Iterator, Protocol, Sequence as Indices
@@ -25,7 +25,8 @@ from aim_slam_ros.loop_closure.retrieval import RetrievalError
 from aim_slam_ros.models import make_model
 from aim_slam_ros.models.base import GeometryModel
 from aim_slam_ros.recorded_truth import RecordedTruth
-from aim_slam_ros.types import CorrectedKeyframes, FrameResult, Keyframe, KeyframeEvent
+from aim_slam_ros.types import (Cloud, CorrectedKeyframes, FrameResult, Keyframe, KeyframeEvent,
+                                TrackingStatus)
 
 _log = logging.getLogger(__name__)
 Progress = Callable[[FrameResult | None], None]
@@ -165,6 +166,14 @@ class _Run:
             keyframes=tuple(PlacedKeyframe(k.keyframe_id, k.piece_id, k.stamp_ns, k.T_world_kf)
                             for k in self._frontend.keyframes),
             loops=tuple(LoopPair(loop.newer, loop.older) for loop in self._loop_closure.loops),
-            map_cloud=self._loop_closure.fused_map(),
+            map_cloud=self._map_cloud(),
             rotation_only_inferences=self._frontend.rotation_only_inferences,
             interrupted=interrupted)
+
+    def _map_cloud(self) -> Cloud:
+        """Of the piece that the trajectory is of: the one with most tracked frames."""
+        pieces = self._loop_closure.pieces
+        frames = Counter(pieces[r.reference_id] for r in self._results
+                         if r.status is TrackingStatus.TRACKED and r.reference_id is not None
+                         and r.reference_id in pieces)
+        return self._loop_closure.fused_map(frames.most_common(1)[0][0] if frames else None)
